@@ -1,0 +1,1 @@
+//! Trajectories on disk: the LeRobot v3 layout in Arrow and Parquet, statistics, validation, reports.

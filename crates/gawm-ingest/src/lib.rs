@@ -1,0 +1,1 @@
+//! Raw robot and simulator logs to datasets.

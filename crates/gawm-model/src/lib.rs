@@ -1,0 +1,1 @@
+//! The world model in candle: encoder, predictor, heads, objectives, optimiser, checkpoints.

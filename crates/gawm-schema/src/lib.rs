@@ -1,0 +1,14 @@
+//! What trajectories and batches are: features, roles, units, kinds, encodings, statistics. No I/O.
+//!
+//! A [`Schema`] lists the [`Feature`]s of a dataset. A vector feature is a sequence of [`Part`]s; a part is a run of
+//! [`Dim`]s that share a [`Kind`] (a quaternion is one part of four dims, six joint angles are one part of six dims).
+//! The kind decides how raw values become continuous columns.
+//!
+//! **Invariant**: this crate knows neither files nor tensors.
+#![forbid(unsafe_code)]
+
+mod feature;
+mod kind;
+
+pub use feature::{Dim, Feature, FeatureData, FloatType, ImageSpec, Part, Role, Schema, StreamInfo};
+pub use kind::{EulerSequence, Kind, QuaternionOrder, Unit, Wrap};

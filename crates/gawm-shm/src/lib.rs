@@ -1,0 +1,1 @@
+//! Batches between processes in fixed-layout shared-memory slots.

@@ -1,0 +1,1 @@
+//! Environments and log collection: native TwoRoom.

@@ -1,0 +1,1 @@
+//! End-to-end tests that spawn the real programs; see `tests/`.
