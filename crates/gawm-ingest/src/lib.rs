@@ -1,1 +1,4 @@
 //! Raw robot and simulator logs to datasets.
+#![forbid(unsafe_code)]
+
+pub mod log;
