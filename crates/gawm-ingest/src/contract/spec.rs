@@ -22,6 +22,8 @@ pub struct Contract {
     pub disorder_window_ms: f64,
     /// When no mapped stream has a sample for longer than this, in s, the episode is split whatever the gap rules say.
     pub max_gap_s: f64,
+    /// How numbers are stored: `float64` (lossless for what logs hold) or `float32`.
+    pub float: gawm_schema::FloatType,
     /// When rows are made.
     pub ticks: TicksSpec,
     /// What becomes of which topic, in the order of the columns.
@@ -51,6 +53,7 @@ impl Default for Contract {
             labels: LabelsSpec::default(),
             calibration: CalibrationSpec::default(),
             split: SplitSpec::default(),
+            float: gawm_schema::FloatType::Float64,
         }
     }
 }
@@ -576,12 +579,10 @@ impl Default for CalibrationSpec {
 pub struct SplitSpec {
     /// Share of sessions (of episodes where no session is known) that are for validation, 0 to 1.
     pub validation: f64,
-    /// Salt of the hash that chooses them.
-    pub seed: u64,
 }
 
 impl Default for SplitSpec {
     fn default() -> Self {
-        Self { validation: 0.1, seed: 0 }
+        Self { validation: 0.1 }
     }
 }
