@@ -2,5 +2,9 @@
 #![forbid(unsafe_code)]
 
 pub mod align;
+pub mod cli;
 pub mod contract;
+pub mod decode;
+pub mod episodes;
 pub mod log;
+pub mod run;

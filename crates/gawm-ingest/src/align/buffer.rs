@@ -72,10 +72,6 @@ impl<I: Clone> Buffer<I> {
         at
     }
 
-    pub(crate) fn len(&self) -> usize {
-        self.times.len()
-    }
-
     pub(crate) fn time(&self, index: usize) -> SampleTime {
         self.times[index]
     }

@@ -69,13 +69,13 @@ pub enum RunError {
         /// Why.
         detail: String,
     },
-    /// A side file cannot be used.
-    #[error("{path:?}: {detail}")]
-    SideFile {
-        /// The file.
-        path: PathBuf,
+    /// Labels cannot be read.
+    #[error("{file}: {source}")]
+    Labels {
+        /// The contract.
+        file: String,
         /// Why.
-        detail: String,
+        source: crate::episodes::LabelError,
     },
     /// The dataset cannot be written.
     #[error("cannot write the dataset {dir:?}: {source}")]
@@ -130,6 +130,12 @@ pub enum RunError {
         path: PathBuf,
         /// Why.
         source: std::io::Error,
+    },
+    /// Threads cannot be started.
+    #[error("cannot start threads: {detail}")]
+    Threads {
+        /// Why.
+        detail: String,
     },
     /// The user interrupted.
     #[error("interrupted")]
@@ -211,9 +217,28 @@ impl RunError {
             | RunError::NoMatch { .. }
             | RunError::Feature { .. }
             | RunError::Schemas { .. }
-            | RunError::SideFile { .. } => 2,
+            | RunError::Labels { .. } => 2,
             RunError::Interrupted => 130,
             _ => 1,
+        }
+    }
+}
+
+impl Refusal {
+    /// Returns what the reader can do about it.
+    pub fn hint(&self) -> Option<String> {
+        match self {
+            Refusal::Open(error) => error.hint(),
+            Refusal::MissingTopic { .. } => {
+                Some("correct the topic, or remove the stream from the contract if this log cannot have it".to_owned())
+            }
+            Refusal::EmptyStream { .. } => {
+                Some("gap = \"mask\" makes a stream of numbers optional; `gawm-ingest inspect LOG` shows the topic".to_owned())
+            }
+            Refusal::NoEpisode { .. } => {
+                Some("larger tolerance_ms, other clocks or episodes.from may fit; `gawm-ingest inspect LOG` shows rates and gaps".to_owned())
+            }
+            Refusal::OtherSchema { .. } => Some("ingest it with its own contract into a dataset of its own".to_owned()),
         }
     }
 }
