@@ -1,1 +1,5 @@
 //! Raw robot and simulator logs to datasets.
+
+#![forbid(unsafe_code)]
+
+pub mod decode;
