@@ -1,4 +1,6 @@
 //! Raw robot and simulator logs to datasets.
 #![forbid(unsafe_code)]
 
+pub mod inspect;
 pub mod log;
+pub mod records;
