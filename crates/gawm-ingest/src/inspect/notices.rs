@@ -3,6 +3,8 @@
 use super::clocks::ClockOffset;
 use super::report::{ChannelReport, FileReport, Notice, NoticeKind};
 use super::shared_topics;
+use super::statistics::CLOCK_RESET_NS;
+use super::text::plural;
 
 /// A gap shorter than this is jitter whatever the rate.
 const GAP_MIN_MS: f64 = 50.0;
@@ -73,11 +75,11 @@ fn channel_notices(
         add(
             NoticeKind::Duplicates,
             topic,
-            format!("{} messages repeat an earlier one exactly", channel.duplicates),
+            format!("{} repeating an earlier one exactly", plural(channel.duplicates, "message")),
         );
     }
     if let Some(missing) = channel.missing_by_sequence.filter(|&missing| missing > 0) {
-        add(NoticeKind::MissingBySequence, topic, format!("{missing} sequence numbers are skipped"));
+        add(NoticeKind::MissingBySequence, topic, format!("{} skipped", plural(missing, "sequence number")));
     }
     if let Some(detail) = gaps(channel, channel.rate.as_ref()) {
         match &channel.publish_rate {
@@ -114,6 +116,9 @@ fn gaps(channel: &ChannelReport, rate: Option<&super::Rate>) -> Option<String> {
 fn ends_early(file: &FileReport, channel: &ChannelReport) -> Option<String> {
     let rate =
         channel.rate.as_ref().filter(|rate| channel.messages >= GAP_MIN_MESSAGES && is_regular(rate))?;
+    if channel.largest_backward_ms * 1e6 >= CLOCK_RESET_NS as f64 {
+        return None;
+    }
     let (start, end, last) = (file.start_ns?, file.end_ns?, channel.end_ns?);
     let silent_s = end.saturating_sub(last) as f64 / 1e9;
     let span_s = end.saturating_sub(start) as f64 / 1e9;

@@ -14,6 +14,9 @@ const GAP_PERIODS: f64 = 3.0;
 /// Messages of a channel among which an exact duplicate is looked for.
 const DUPLICATE_WINDOW: usize = 64;
 
+/// A step back of this size is a clock that was reset: what follows repeats times, not messages.
+pub(super) const CLOCK_RESET_NS: u64 = 1_000_000_000;
+
 /// What statistics need of one message.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Digest {
@@ -143,6 +146,9 @@ impl ChannelStatistics {
     pub(super) fn add(&mut self, message: &Digest) {
         self.messages += 1;
         self.bytes += message.n_bytes;
+        if self.log.last_ns.is_some_and(|last| message.log_time_ns.saturating_add(CLOCK_RESET_NS) <= last) {
+            self.recent.clear();
+        }
         self.count_duplicate(message);
         self.count_sequence(message.sequence);
         let log_ns = message.log_time_ns;

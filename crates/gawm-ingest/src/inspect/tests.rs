@@ -79,7 +79,7 @@ fn lost_messages_are_a_gap_and_skipped_numbers() {
         [NoticeKind::Gap, NoticeKind::MissingBySequence]
     );
     assert_eq!(notices[0].1, "a gap of 210 ms at 0.990 s (period 10.0 ms)");
-    assert_eq!(notices[1].1, "20 sequence numbers are skipped");
+    assert_eq!(notices[1].1, "20 sequence numbers skipped");
 }
 
 #[test]

@@ -133,3 +133,17 @@ fn one_flipped_bit_in_a_chunked_log_with_summary_costs_at_most_one_chunk() {
         assert!(count + largest >= 60, "a flipped bit at {at} leaves {count} messages of 60");
     }
 }
+
+#[test]
+fn a_cut_compressed_chunk_gives_its_readable_prefix() {
+    for layout in [LAYOUTS[0], LAYOUTS[1]] {
+        let options = layout.options().chunk_size(Some(4 << 20));
+        let mut writer = TestWriter(options.create(Cursor::new(Vec::new())).unwrap());
+        writer.channel(0, "/a");
+        (0..1000).for_each(|i| writer.message(1, i, 1_000 + u64::from(i), &payload(i, 1000)));
+        let bytes = writer.finish();
+        let counts: Vec<usize> =
+            [30, 60, 90].iter().map(|percent| n_readable(&bytes[..bytes.len() * percent / 100])).collect();
+        assert!(counts[0] > 100 && counts[1] > 450 && counts[2] > 750, "{}: {counts:?}", layout.name);
+    }
+}
