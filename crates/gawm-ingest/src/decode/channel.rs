@@ -160,3 +160,16 @@ fn ros_fault(channel: &ChannelSchema<'_>, fault: Fault) -> CompileError {
         fault => bad_schema(channel, describe(&fault)),
     }
 }
+
+impl<'a> From<&'a crate::log::Channel> for ChannelSchema<'a> {
+    fn from(channel: &'a crate::log::Channel) -> Self {
+        let schema = channel.schema.as_deref();
+        Self {
+            topic: &channel.topic,
+            message_encoding: &channel.message_encoding,
+            schema_name: schema.map_or("", |s| &s.name),
+            schema_encoding: schema.map_or("", |s| &s.encoding),
+            schema_data: schema.map_or(&[], |s| &s.data),
+        }
+    }
+}
