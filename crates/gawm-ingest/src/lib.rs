@@ -6,5 +6,7 @@ pub mod cli;
 pub mod contract;
 pub mod decode;
 pub mod episodes;
+pub mod inspect;
 pub mod log;
+pub mod records;
 pub mod run;

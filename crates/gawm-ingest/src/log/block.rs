@@ -56,6 +56,8 @@ pub struct BlockRef {
     pub offset: u64,
     /// Stored bytes, record prefixes included.
     pub length: u64,
+    /// Name of the chunk's compression, empty for none.
+    pub compression: String,
     /// Bytes that the block holds once read: what a memory budget should count.
     pub uncompressed_bytes: u64,
     /// Earliest log time, messages with log time 0 left out; `None` when the block has no messages.
@@ -70,6 +72,35 @@ pub struct BlockRef {
     pub clock_segment: u32,
     /// Whether the file ends inside the block.
     pub is_cut: bool,
+    /// Which of its messages are read: a chunk whose channels lie far apart in time is read once for each group of them.
+    pub(crate) part: BlockPart,
+}
+
+/// The messages of a block that are read.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) enum BlockPart {
+    /// All of them.
+    #[default]
+    Whole,
+    /// All but those of some channels; damage is reported here.
+    Without(Arc<[u16]>),
+    /// Those of some channels alone.
+    Only(Arc<[u16]>),
+}
+
+impl BlockPart {
+    fn has(&self, id: u16) -> bool {
+        match self {
+            Self::Whole => true,
+            Self::Without(ids) => !ids.contains(&id),
+            Self::Only(ids) => ids.contains(&id),
+        }
+    }
+
+    /// Returns whether the block's other part reports its damage.
+    pub(crate) fn is_repeat(&self) -> bool {
+        matches!(self, Self::Only(_))
+    }
 }
 
 /// One message; its payload is a range of its block's data.
@@ -128,7 +159,10 @@ pub(crate) fn read_block(source: &Source, table: &ChannelTable, block: &BlockRef
     let mut parser = BlockParser::new(table, block);
     let data = match block.kind {
         BlockKind::Loose => read_loose(source, block, limits),
-        BlockKind::Chunk => read_chunk(source, block, limits, &mut parser.damage),
+        BlockKind::Chunk => read_chunk(source, block, limits, &mut parser.damage).map(|chunk| {
+            parser.stated_span = Some((chunk.header.start_time, chunk.header.end_time));
+            chunk.data
+        }),
     };
     match data {
         Ok(data) => parser.parse(&data),
@@ -172,10 +206,10 @@ fn read_chunk(
     block: &BlockRef,
     limits: Limits,
     damage: &mut Vec<Damage>,
-) -> Result<Bytes, Damage> {
+) -> Result<UnpackedChunk, Damage> {
     let chunk = unpack_chunk(source, block, limits, damage)?;
     check_chunk(&chunk, block.offset, damage)?;
-    Ok(chunk.data)
+    Ok(chunk)
 }
 
 /// Reads and decompresses a chunk without a look at its CRC.
@@ -293,6 +327,8 @@ struct BlockParser<'a> {
     unknown: BTreeMap<u16, (u64, u64)>,
     damage: Vec<Damage>,
     data: Bytes,
+    /// The log times between which the chunk's header puts its messages.
+    stated_span: Option<(u64, u64)>,
 }
 
 impl<'a> BlockParser<'a> {
@@ -308,6 +344,7 @@ impl<'a> BlockParser<'a> {
             unknown: BTreeMap::new(),
             damage: Vec::new(),
             data: Bytes::new(),
+            stated_span: None,
         }
     }
 
@@ -365,6 +402,9 @@ impl<'a> BlockParser<'a> {
 
     fn message(&mut self, record: &RawRecord<'_>) -> Option<()> {
         let header = MessageHeader::parse(record.body)?;
+        if !self.block.part.has(header.channel_id) {
+            return Some(());
+        }
         let offset = self.offset_of(record);
         let Some(channel) = self.slot(header.channel_id) else {
             self.unknown.entry(header.channel_id).or_insert((0, offset)).0 += 1;
@@ -458,6 +498,10 @@ impl<'a> BlockParser<'a> {
             self.damage.push(Damage::new(DamageKind::UnknownChannel, offset, detail));
         }
         self.check_times();
+        if self.block.part.is_repeat() {
+            self.damage.clear();
+            self.new_channels.clear();
+        }
         Block {
             messages: self.messages,
             data: self.data,
@@ -468,11 +512,7 @@ impl<'a> BlockParser<'a> {
     }
 
     fn check_times(&mut self) {
-        let (BlockKind::Chunk, Some(start), Some(end)) =
-            (self.block.kind, self.block.start_ns, self.block.end_ns)
-        else {
-            return;
-        };
+        let Some((start, end)) = self.stated_span else { return };
         let times = self.messages.iter().map(|message| message.log_time_ns).filter(|&time| time != 0);
         let n_outside = times.filter(|time| !(start..=end).contains(time)).count();
         if n_outside > 0 {

@@ -30,6 +30,7 @@ mod damage;
 mod decompress;
 mod definitions;
 mod error;
+mod listing;
 mod open;
 mod order;
 mod recording;
@@ -51,6 +52,8 @@ use std::sync::Arc;
 use channel::ChannelTable;
 use source::Source;
 use wire::{AttachmentHeader, Header};
+
+pub(crate) use listing::RecordSource;
 
 pub use block::{Block, BlockKind, BlockRef, Message};
 pub use channel::{Channel, Schema};
@@ -210,6 +213,27 @@ impl Log {
     /// Returns the blocks in reading order.
     pub fn blocks(&self) -> &[BlockRef] {
         &self.blocks
+    }
+
+    /// Returns each block once and whole, in the order of the file.
+    pub fn blocks_in_file_order(&self) -> Vec<BlockRef> {
+        let mut blocks: Vec<BlockRef> =
+            self.blocks.iter().filter(|block| !block.part.is_repeat()).cloned().collect();
+        blocks.iter_mut().for_each(|block| block.part = block::BlockPart::Whole);
+        blocks.sort_by_key(|block| block.offset);
+        blocks
+    }
+
+    /// Returns the number of chunks per compression; `none` stands for uncompressed ones.
+    pub fn compressions(&self) -> BTreeMap<String, u64> {
+        let mut counts = BTreeMap::new();
+        for block in
+            self.blocks.iter().filter(|block| block.kind == BlockKind::Chunk && !block.part.is_repeat())
+        {
+            let name = if block.compression.is_empty() { "none" } else { &block.compression };
+            *counts.entry(name.to_owned()).or_default() += 1;
+        }
+        counts
     }
 
     /// Returns what the writer counted, if it wrote that down.

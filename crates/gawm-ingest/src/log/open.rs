@@ -1,6 +1,5 @@
 //! Opens a log, and reads its parts.
 
-use std::fs::File;
 use std::io;
 use std::path::Path;
 
@@ -31,13 +30,7 @@ impl Log {
     /// - [`OpenLogError::NotAFile`], [`OpenLogError::Empty`], [`OpenLogError::NotMcap`]: there is nothing to read.
     ///   All other damage is in [`Log::damage`].
     pub fn open(path: &Path, options: &OpenOptions) -> Result<Self, OpenLogError> {
-        let io_error = |source| OpenLogError::Io { path: path.to_owned(), source };
-        let about = std::fs::metadata(path).map_err(io_error)?;
-        if !about.is_file() {
-            return Err(OpenLogError::NotAFile { path: path.to_owned() });
-        }
-        let file = File::open(path).map_err(io_error)?;
-        Self::from_source(path, Source::File { file, length: about.len() }, options)
+        Self::from_source(path, Source::open(path)?, options)
     }
 
     /// Opens a log that lies in memory; `path` is only a name for it.
@@ -183,7 +176,7 @@ impl Log {
     }
 }
 
-fn limits(options: &OpenOptions) -> Limits {
+pub(super) fn limits(options: &OpenOptions) -> Limits {
     Limits { record_bytes: options.max_record_bytes, chunk_bytes: options.max_chunk_bytes }
 }
 
@@ -202,7 +195,7 @@ impl From<Statistics> for SummaryCounts {
 }
 
 /// Refuses what is no MCAP file; returns the footer of one that has it.
-fn check_magic(
+pub(super) fn check_magic(
     path: &Path,
     source: &Source,
     limits: Limits,

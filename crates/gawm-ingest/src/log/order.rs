@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use super::block::{BlockKind, BlockRef, ChannelSpan, Limits, read_block};
+use super::block::{BlockKind, BlockPart, BlockRef, ChannelSpan, Limits, read_block};
 use super::channel::ChannelTable;
 use super::source::Source;
 use super::wire::{MessageIndex, Parse, RECORD_PREFIX, op, record_prefix};
@@ -21,7 +21,7 @@ pub(crate) fn reading_order(
     table: &ChannelTable,
     limits: Limits,
     window_ns: u64,
-    blocks: &mut [BlockRef],
+    blocks: &mut Vec<BlockRef>,
 ) {
     for block in blocks.iter_mut().filter(|block| needs_real_start(block)) {
         let spans = channel_spans(source, table, limits, block);
@@ -32,6 +32,7 @@ pub(crate) fn reading_order(
     // The ends and not the starts are compared, so that a chunk inside which the clock was reset is noticed.
     if runs_back(blocks, window_ns) {
         find_segments(source, table, limits, window_ns, blocks);
+        split_straddling(window_ns, blocks);
     }
     // A block without messages has no time; it goes with the block before it.
     let mut time = 0;
@@ -90,6 +91,53 @@ fn find_segments(
         block.clock_segment = segment;
         block.spans = Some(spans);
     }
+}
+
+/// Splits blocks in which one topic's messages end and another's begin at a much earlier time.
+///
+/// Such a block lies in a log whose topics were written one after the other; read as one, it would be out of order wherever it is put.
+fn split_straddling(window_ns: u64, blocks: &mut Vec<BlockRef>) {
+    let mut split = Vec::new();
+    let mut latest_end = 0;
+    let mut segment = 0;
+    for block in blocks.iter_mut() {
+        if block.clock_segment != segment {
+            (segment, latest_end) = (block.clock_segment, 0);
+        }
+        let runs_back = block.start_ns.is_some_and(|start| start.saturating_add(window_ns) < latest_end);
+        latest_end = latest_end.max(block.end_ns.unwrap_or(0));
+        if runs_back {
+            split.extend(split_off_later(window_ns, block));
+        }
+    }
+    blocks.append(&mut split);
+}
+
+/// Takes the channels out of a block that begin later than the others by more than the window; returns them as blocks.
+fn split_off_later(window_ns: u64, block: &mut BlockRef) -> Vec<BlockRef> {
+    let mut spans = block.spans.as_deref().unwrap_or_default().to_vec();
+    spans.sort_by_key(|span| (span.first_ns, span.id));
+    let is_border = |a: &ChannelSpan, b: &ChannelSpan| b.first_ns.saturating_sub(a.first_ns) <= window_ns;
+    let mut groups = spans.chunk_by(is_border);
+    let first = groups.next().unwrap_or_default().to_vec();
+    let part = |group: &[ChannelSpan], part: BlockPart, whole: &BlockRef| BlockRef {
+        start_ns: group.iter().map(|span| span.first_ns).min(),
+        end_ns: group.iter().map(|span| span.last_ns).max(),
+        channel_ids: Some(group.iter().map(|span| span.id).collect()),
+        spans: Some(group.into()),
+        part,
+        ..whole.clone()
+    };
+    let ids = |group: &[ChannelSpan]| group.iter().map(|span| span.id).collect::<Arc<[u16]>>();
+    let later: Vec<BlockRef> = groups.map(|group| part(group, BlockPart::Only(ids(group)), block)).collect();
+    if !later.is_empty() {
+        let taken: Arc<[u16]> = later
+            .iter()
+            .flat_map(|block| block.channel_ids.iter().flat_map(|ids| ids.iter().copied()))
+            .collect();
+        *block = part(&first, BlockPart::Without(taken), block);
+    }
+    later
 }
 
 /// Returns the log times of each channel in a block: from message indexes if they follow the chunk, else by reading it.

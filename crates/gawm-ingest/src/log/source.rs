@@ -79,6 +79,9 @@ impl<'a> Window<'a> {
     /// Returns `length` bytes at `offset`, or fewer when the source ends before; the caller has capped `length`.
     pub(crate) fn peek(&mut self, offset: u64, length: u64) -> io::Result<&[u8]> {
         let length = length.min(self.source.len().saturating_sub(offset));
+        if length == 0 {
+            return Ok(&[]);
+        }
         let end = self.start + self.bytes.len() as u64;
         if offset < self.start || offset + length > end {
             let in_sequence = offset >= self.start && offset <= end;

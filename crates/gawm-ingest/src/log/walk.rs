@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::sync::Arc;
 
-use super::block::{BlockKind, BlockRef, ChannelSpan, Limits};
+use super::block::{BlockKind, BlockPart, BlockRef, ChannelSpan, Limits};
 use super::channel::Definition;
 use super::damage::{Damage, DamageKind};
 use super::source::{Source, Window};
@@ -271,6 +271,7 @@ impl<'a> Walk<'a> {
             kind: BlockKind::Loose,
             offset: run.start,
             length: run.end - run.start,
+            compression: String::new(),
             uncompressed_bytes: run.end - run.start,
             start_ns: spans.iter().map(|span| span.first_ns).min(),
             end_ns: spans.iter().map(|span| span.last_ns).max(),
@@ -278,6 +279,7 @@ impl<'a> Walk<'a> {
             spans: Some(spans),
             clock_segment: 0,
             is_cut: false,
+            part: BlockPart::Whole,
         });
     }
 }
@@ -296,6 +298,7 @@ pub(crate) fn chunk_block(header: &ChunkHeader, offset: u64, length: u64) -> Blo
         kind: BlockKind::Chunk,
         offset,
         length,
+        compression: header.compression.clone(),
         uncompressed_bytes: header.uncompressed_size,
         start_ns: has_times.then_some(header.start_time),
         end_ns: has_times.then_some(header.end_time),
@@ -303,6 +306,7 @@ pub(crate) fn chunk_block(header: &ChunkHeader, offset: u64, length: u64) -> Blo
         spans: None,
         clock_segment: 0,
         is_cut: false,
+        part: BlockPart::Whole,
     }
 }
 
