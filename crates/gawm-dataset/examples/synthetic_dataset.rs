@@ -8,8 +8,8 @@ use std::path::Path;
 
 use bytes::Bytes;
 use gawm_dataset::{
-    AgeColumns, DatasetSpec, DatasetWriter, EpisodeInfo, ImageColumn, RecordingInfo, Rows, SourceFile, Trajectory,
-    VectorColumn, WriteMode,
+    AgeColumns, DatasetSpec, DatasetWriter, EpisodeInfo, ImageColumn, RecordingInfo, Rows, SourceFile,
+    Trajectory, VectorColumn, WriteMode,
 };
 use gawm_schema::{ContentHash, Schema};
 
@@ -73,7 +73,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         writer.begin_recording(source)?;
         for (i, n) in lengths.into_iter().enumerate() {
             writer.begin_episode(EpisodeInfo {
-                task: ["put the red cube into the box", "open the upper drawer slowly"][(number + i) % 2].to_owned(),
+                task: ["put the red cube into the box", "open the upper drawer slowly"][(number + i) % 2]
+                    .to_owned(),
                 success: [Some(true), Some(false), None][number * 2 + i],
                 session: format!("session-{number}"),
                 ..EpisodeInfo::default()
@@ -87,7 +88,10 @@ fn main() -> Result<(), Box<dyn Error>> {
         writer.end_recording()?;
     }
     let summary = writer.finish()?;
-    println!("{} episodes, {} frames, {} bytes in {out}", summary.episodes, summary.frames, summary.data_bytes);
+    println!(
+        "{} episodes, {} frames, {} bytes in {out}",
+        summary.episodes, summary.frames, summary.data_bytes
+    );
     Ok(())
 }
 
@@ -115,7 +119,10 @@ fn rows(seed: usize, range: std::ops::Range<usize>, n: usize, side: u32) -> Resu
         images.push(ImageColumn { frames, valid: vec![true; range.len()] });
     }
     Ok(Rows {
-        time_ns: range.clone().map(|i| 1_700_000_000_000_000_000 + (seed * 1_000_000 + i) as i64 * 100_000_000).collect(),
+        time_ns: range
+            .clone()
+            .map(|i| 1_700_000_000_000_000_000 + (seed * 1_000_000 + i) as i64 * 100_000_000)
+            .collect(),
         vectors: vec![state, action, intervention],
         images,
         ages: AgeColumns {

@@ -118,8 +118,11 @@ pub(crate) fn count_frames(
             .filter(|&row| valid[row] && is_sampled(first_frame + row as u64))
             .map(|row| &frames[row])
             .collect();
-        let counted: Vec<CameraStats> =
-            sampled.par_iter().filter_map(|frame| decode_pixels(frame).ok()).map(|p| count_pixels(&p)).collect();
+        let counted: Vec<CameraStats> = sampled
+            .par_iter()
+            .filter_map(|frame| decode_pixels(frame).ok())
+            .map(|p| count_pixels(&p))
+            .collect();
         let stats = cameras.entry(image.name.clone()).or_default();
         counted.iter().for_each(|one| stats.merge(one));
     }

@@ -101,7 +101,11 @@ impl DataFile {
 
     /// Gives up all rows behind a mark; `None` when nothing is left. Parquet cannot take rows back, so what stays is
     /// copied row group by row group: slow, and rare.
-    pub(crate) fn rewind(mut self, columns: &Columns, mark: FileMark) -> Result<Option<DataFile>, ParquetError> {
+    pub(crate) fn rewind(
+        mut self,
+        columns: &Columns,
+        mark: FileMark,
+    ) -> Result<Option<DataFile>, ParquetError> {
         if mark == self.mark && self.group_bytes == 0 {
             return Ok(Some(self));
         }

@@ -142,8 +142,14 @@ impl DatasetWriter {
             self.tasks.push(info.task.clone());
             self.tasks.len() - 1
         });
-        recording.episode =
-            Some(OpenEpisode::new(&self.columns, info, n_episodes, task as u64, first_index, self.spec.schema.hash()));
+        recording.episode = Some(OpenEpisode::new(
+            &self.columns,
+            info,
+            n_episodes,
+            task as u64,
+            first_index,
+            self.spec.schema.hash(),
+        ));
         Ok(())
     }
 
@@ -359,4 +365,6 @@ fn fill_source(record: &mut EpisodeRecord, source: &RecordingInfo) {
 }
 
 #[cfg(test)]
-mod tests;
+mod layout_tests;
+#[cfg(test)]
+pub(crate) mod tests;

@@ -98,11 +98,13 @@ fn decode_jpeg(bytes: &[u8]) -> Result<Pixels, DecodePixelsError> {
 
 fn decode_png(bytes: &[u8]) -> Result<Pixels, DecodePixelsError> {
     let format = "PNG";
-    let mut decoder = png::Decoder::new_with_limits(Cursor::new(bytes), png::Limits { bytes: MAX_DECODED_BYTES });
+    let mut decoder =
+        png::Decoder::new_with_limits(Cursor::new(bytes), png::Limits { bytes: MAX_DECODED_BYTES });
     decoder.set_transformations(png::Transformations::EXPAND);
     let mut reader = decoder.read_info().map_err(|error| damaged(format, error))?;
     let size = reader.output_buffer_size().filter(|&size| size <= MAX_DECODED_BYTES);
-    let size = size.ok_or_else(|| DecodePixelsError::Unsupported { format, what: "too many pixels".to_owned() })?;
+    let size =
+        size.ok_or_else(|| DecodePixelsError::Unsupported { format, what: "too many pixels".to_owned() })?;
     let mut buffer = vec![0; size];
     let info = reader.next_frame(&mut buffer).map_err(|error| damaged(format, error))?;
     buffer.truncate(info.buffer_size());
@@ -120,8 +122,9 @@ fn decode_tiff(bytes: &[u8]) -> Result<Pixels, DecodePixelsError> {
     let format = "TIFF";
     let mut limits = tiff::decoder::Limits::default();
     limits.decoding_buffer_size = MAX_DECODED_BYTES;
-    let mut decoder =
-        tiff::decoder::Decoder::new(Cursor::new(bytes)).map_err(|error| damaged(format, error))?.with_limits(limits);
+    let mut decoder = tiff::decoder::Decoder::new(Cursor::new(bytes))
+        .map_err(|error| damaged(format, error))?
+        .with_limits(limits);
     let (width, height) = decoder.dimensions().map_err(|error| damaged(format, error))?;
     let (width, height) = (width as usize, height as usize);
     let values = match decoder.read_image().map_err(|error| damaged(format, error))? {

@@ -41,7 +41,13 @@ impl DatasetWriter {
         self.keep(CALIBRATION, name, &file_name, &bytes)
     }
 
-    fn keep(&mut self, folder: &str, name: &str, file_name: &str, bytes: &[u8]) -> Result<String, WriteError> {
+    fn keep(
+        &mut self,
+        folder: &str,
+        name: &str,
+        file_name: &str,
+        bytes: &[u8],
+    ) -> Result<String, WriteError> {
         let recording = open_recording(&mut self.recording, "add_attachment")?;
         let hash = ContentHash::of(bytes);
         let known = || {

@@ -100,7 +100,12 @@ impl OpenEpisode {
     }
 
     /// Takes rows; full blocks go to the file.
-    pub(super) fn write(&mut self, columns: &Columns, file: &mut DataFile, rows: Rows) -> Result<(), WriteError> {
+    pub(super) fn write(
+        &mut self,
+        columns: &Columns,
+        file: &mut DataFile,
+        rows: Rows,
+    ) -> Result<(), WriteError> {
         check_shape(columns, &rows)?;
         self.check_continuity(columns, &rows)?;
         let mut start = 0;
@@ -123,7 +128,11 @@ impl OpenEpisode {
     }
 
     /// Writes what is left and closes the row group.
-    pub(super) fn finish(mut self, columns: &Columns, file: &mut DataFile) -> Result<DoneEpisode, WriteError> {
+    pub(super) fn finish(
+        mut self,
+        columns: &Columns,
+        file: &mut DataFile,
+    ) -> Result<DoneEpisode, WriteError> {
         self.flush(columns, file)?;
         file.end_row_group().map_err(WriteError::parquet(file.path()))?;
         let info = self.info;
@@ -169,7 +178,8 @@ impl OpenEpisode {
             first_frame: self.n_written as i64,
             first_index: (self.first_index + self.n_written) as i64,
         };
-        file.write(columns, &self.block, position, self.block_bytes).map_err(WriteError::parquet(file.path()))?;
+        file.write(columns, &self.block, position, self.block_bytes)
+            .map_err(WriteError::parquet(file.path()))?;
         self.totals.update(columns, &self.block);
         crate::camera::count_frames(columns, &self.block, self.n_written, &mut self.cameras);
         self.hash_block(columns);

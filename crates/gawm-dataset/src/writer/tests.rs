@@ -154,13 +154,14 @@ pub(crate) fn rows(seed: u64, range: std::ops::Range<usize>, n: usize) -> Rows {
 
 pub(crate) fn recording(number: u64) -> RecordingInfo {
     let hash = ContentHash::of(&number.to_le_bytes());
-    let file = SourceFile { name: format!("log-{number}.mcap"), content_hash: hash, length_bytes: 1000 + number };
+    let file =
+        SourceFile { name: format!("log-{number}.mcap"), content_hash: hash, length_bytes: 1000 + number };
     RecordingInfo { content_hash: hash, files: vec![file], notes: BTreeMap::new() }
 }
 
 /// Lengths of the episodes of a recording.
 fn lengths(number: u64) -> Vec<usize> {
-    vec![30 + number as usize, 1500, 20]
+    vec![30 + number as usize, 1100, 20]
 }
 
 fn write_recording(writer: &mut DatasetWriter, number: u64, piece: usize) -> Result<(), WriteError> {
@@ -187,14 +188,14 @@ fn write_recording(writer: &mut DatasetWriter, number: u64, piece: usize) -> Res
     writer.end_recording()
 }
 
-fn write_all(dir: &Path, mode: WriteMode, recordings: &[u64], piece: usize) -> DatasetSummary {
+pub(crate) fn write_all(dir: &Path, mode: WriteMode, recordings: &[u64], piece: usize) -> DatasetSummary {
     let mut writer = DatasetWriter::create(dir, spec(), mode).unwrap();
     recordings.iter().for_each(|&number| write_recording(&mut writer, number, piece).unwrap());
     writer.finish().unwrap()
 }
 
 /// Returns all files of a folder with their content.
-fn tree(dir: &Path) -> BTreeMap<String, Vec<u8>> {
+pub(crate) fn tree(dir: &Path) -> BTreeMap<String, Vec<u8>> {
     fn walk(dir: &Path, root: &Path, files: &mut BTreeMap<String, Vec<u8>>) {
         for entry in fs::read_dir(dir).unwrap() {
             let path = entry.unwrap().path();
@@ -225,7 +226,7 @@ fn writes_what_design_says() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("out");
     let summary = write_all(&out, WriteMode::New, &[0, 1], 100);
-    assert_eq!((summary.recordings, summary.episodes, summary.frames), (2, 6, 3101));
+    assert_eq!((summary.recordings, summary.episodes, summary.frames), (2, 6, 2301));
     let files: Vec<String> = tree(&out).into_keys().collect();
     assert_eq!(
         files,
@@ -261,7 +262,7 @@ fn appending_equals_one_run() {
     write_all(&b, WriteMode::New, &[0], 500);
     write_all(&b, WriteMode::Append, &[1], 500);
     let summary = write_all(&b, WriteMode::Append, &[0, 2, 1], 500);
-    assert_eq!((summary.new_recordings, summary.new_episodes, summary.new_frames), (1, 3, 1552));
+    assert_eq!((summary.new_recordings, summary.new_episodes, summary.new_frames), (1, 3, 1152));
     check_same(&a, &b);
 }
 
@@ -296,7 +297,7 @@ fn resuming_at_any_step_equals_an_undisturbed_run() {
     check(&broken);
     assert_eq!(writer.begin_recording(recording(1)).unwrap(), RecordingState::New);
     writer.begin_episode(EpisodeInfo { task: "half".to_owned(), ..EpisodeInfo::default() }).unwrap();
-    writer.write(Trajectory::try_new(&schema(), rows(10, 0..1100, 1500)).unwrap()).unwrap();
+    writer.write(Trajectory::try_new(&schema(), rows(10, 0..1060, 1100)).unwrap()).unwrap();
     check(&broken);
     drop(writer);
     check(&broken);
@@ -344,7 +345,10 @@ fn an_unfinished_append_leaves_the_dataset_as_it_was() {
     let after = tree(&out);
     assert!(before.iter().all(|(name, bytes)| after[name] == *bytes));
     let new: Vec<&String> = after.keys().filter(|name| !before.contains_key(*name)).collect();
-    assert!(new.iter().all(|name| name.starts_with("gawm/journal/") || name.ends_with(".parquet.tmp")), "{new:?}");
+    assert!(
+        new.iter().all(|name| name.starts_with("gawm/journal/") || name.ends_with(".parquet.tmp")),
+        "{new:?}"
+    );
     let error = DatasetWriter::create(&out, spec(), WriteMode::Append).err().unwrap();
     assert!(matches!(error, WriteError::Unfinished { .. }) && error.hint().is_some());
 }
@@ -380,7 +384,7 @@ fn a_discarded_episode_and_an_aborted_recording_leave_no_trace() {
     writer.begin_recording(recording(7)).unwrap();
     writer.add_attachment("robot.urdf", b"<robot/>").unwrap();
     writer.begin_episode(EpisodeInfo { task: "never".to_owned(), ..EpisodeInfo::default() }).unwrap();
-    writer.write(Trajectory::try_new(&schema(), rows(1, 0..1500, 1500)).unwrap()).unwrap();
+    writer.write(Trajectory::try_new(&schema(), rows(1, 0..1100, 1100)).unwrap()).unwrap();
     writer.abort_recording().unwrap();
     write_recording(&mut writer, 0, 300).unwrap();
     writer.finish().unwrap();
@@ -392,7 +396,9 @@ fn a_discarded_episode_and_an_aborted_recording_leave_no_trace() {
     let mut writer = DatasetWriter::create(&c, spec(), WriteMode::New).unwrap();
     writer.begin_recording(recording(0)).unwrap();
     for (n, is_kept) in [(1100, false), (40, true), (3, false), (2500, false), (50, true)] {
-        writer.begin_episode(EpisodeInfo { task: format!("task {is_kept}"), ..EpisodeInfo::default() }).unwrap();
+        writer
+            .begin_episode(EpisodeInfo { task: format!("task {is_kept}"), ..EpisodeInfo::default() })
+            .unwrap();
         writer.write(Trajectory::try_new(&schema(), rows(n as u64, 0..n, n)).unwrap()).unwrap();
         if is_kept { writer.end_episode() } else { writer.discard_episode() }.unwrap();
     }
@@ -429,7 +435,12 @@ fn attachments_are_kept_once_and_inside() {
     assert_eq!(meta.recordings[0].attachments.len(), 4);
 }
 
-fn check_refused(name: &str, mode: WriteMode, change: impl Fn(&mut DatasetSpec), expected: fn(&WriteError) -> bool) {
+fn check_refused(
+    name: &str,
+    mode: WriteMode,
+    change: impl Fn(&mut DatasetSpec),
+    expected: fn(&WriteError) -> bool,
+) {
     let dir = tempfile::tempdir().unwrap();
     write_all(dir.path(), WriteMode::New, &[0], 300);
     let before = tree(dir.path());
@@ -461,7 +472,12 @@ fn what_does_not_fit_is_refused() {
         |spec| spec.contract.push('#'),
         |e| matches!(e, WriteError::SpecChanged { place, .. } if place == "contract"),
     );
-    check_refused("share", WriteMode::Append, |spec| spec.train_share = f64::NAN, |e| matches!(e, WriteError::TrainShare { .. }));
+    check_refused(
+        "share",
+        WriteMode::Append,
+        |spec| spec.train_share = f64::NAN,
+        |e| matches!(e, WriteError::TrainShare { .. }),
+    );
     let empty = tempfile::tempdir().unwrap();
     let error = DatasetWriter::create(empty.path(), spec(), WriteMode::Append).err().unwrap();
     assert!(matches!(error, WriteError::NoDataset { .. }));
@@ -476,7 +492,8 @@ fn what_does_not_fit_is_refused() {
 fn calls_in_the_wrong_order_are_errors() {
     let dir = tempfile::tempdir().unwrap();
     let mut writer = DatasetWriter::create(&dir.path().join("out"), spec(), WriteMode::New).unwrap();
-    let trajectory = |range: std::ops::Range<usize>| Trajectory::try_new(&schema(), rows(0, range, 100)).unwrap();
+    let trajectory =
+        |range: std::ops::Range<usize>| Trajectory::try_new(&schema(), rows(0, range, 100)).unwrap();
     assert!(matches!(writer.begin_episode(EpisodeInfo::default()), Err(WriteError::Order { .. })));
     writer.begin_recording(recording(0)).unwrap();
     assert!(matches!(writer.write(trajectory(0..3)), Err(WriteError::Order { .. })));
@@ -511,5 +528,5 @@ fn a_large_recording_is_cut_at_episodes() {
     let meta: GawmMeta = serde_json::from_slice(&tree(dir.path())["meta/gawm.json"]).unwrap();
     let frames: Vec<Vec<u64>> =
         meta.recordings.iter().map(|r| r.files.iter().map(|file| file.frames).collect()).collect();
-    assert_eq!(frames, [[1530, 20], [1531, 20]]);
+    assert_eq!(frames, [[1130, 20], [1131, 20]]);
 }
