@@ -83,10 +83,13 @@ fn rank_error(sketch: &QuantileSketch, sorted: &[f64]) -> f64 {
         .fold(0.0, f64::max)
 }
 
+/// The i-th value from a random number in [0, 1).
+type Shape = fn(usize, f64) -> f64;
+
 #[test]
 fn quantiles_of_many_values_are_within_half_a_percent_rank() {
     let n = 300_000;
-    let shapes: [(&str, fn(usize, f64) -> f64); 5] = [
+    let shapes: [(&str, Shape); 5] = [
         ("uniform", |_, u| u),
         ("ascending", |i, _| i as f64),
         ("descending", |i, _| -(i as f64)),
