@@ -8,7 +8,7 @@ use gawm_schema::{ContentHash, DimStats, DimSummary, Role};
 use crate::block::{BlockPosition, RowBlock};
 use crate::camera::CameraStats;
 use crate::columns::Columns;
-use crate::data_file::DataFile;
+use crate::data_file::{DataFile, FileMark};
 use crate::episode::{EpisodeRecord, FeatureStats, is_policy_input};
 use crate::error::WriteError;
 use crate::rows::Rows;
@@ -27,6 +27,8 @@ pub(super) struct OpenEpisode {
     number: u64,
     task: u64,
     first_index: u64,
+    /// Where its first row is in the data file.
+    beginning: Option<FileMark>,
     /// Rows that have left the block.
     n_written: u64,
     block: RowBlock,
@@ -63,6 +65,7 @@ impl OpenEpisode {
             number,
             task,
             first_index,
+            beginning: None,
             n_written: 0,
             block: RowBlock::new(columns),
             block_bytes: 0,
@@ -85,12 +88,30 @@ impl OpenEpisode {
         &self.info.id
     }
 
+    pub(super) fn task(&self) -> u64 {
+        self.task
+    }
+
+    /// Notes where the episode begins in the data file; only the first call counts.
+    pub(super) fn begin_in(&mut self, mark: FileMark) {
+        self.beginning.get_or_insert(mark);
+    }
+
+    pub(super) fn beginning(&self) -> Option<FileMark> {
+        self.beginning
+    }
+
     pub(super) fn length(&self) -> u64 {
         self.n_written + self.block.len() as u64
     }
 
     /// Takes rows; full blocks go to the file.
-    pub(super) fn write(&mut self, columns: &Columns, file: &mut DataFile, rows: Rows) -> Result<(), WriteError> {
+    pub(super) fn write(
+        &mut self,
+        columns: &Columns,
+        file: &mut DataFile,
+        rows: Rows,
+    ) -> Result<(), WriteError> {
         check_shape(columns, &rows)?;
         self.check_continuity(columns, &rows)?;
         let mut start = 0;
@@ -113,7 +134,11 @@ impl OpenEpisode {
     }
 
     /// Writes what is left and closes the row group.
-    pub(super) fn finish(mut self, columns: &Columns, file: &mut DataFile) -> Result<DoneEpisode, WriteError> {
+    pub(super) fn finish(
+        mut self,
+        columns: &Columns,
+        file: &mut DataFile,
+    ) -> Result<DoneEpisode, WriteError> {
         self.flush(columns, file)?;
         file.end_row_group().map_err(WriteError::parquet(file.path()))?;
         let info = self.info;
@@ -159,8 +184,10 @@ impl OpenEpisode {
             first_frame: self.n_written as i64,
             first_index: (self.first_index + self.n_written) as i64,
         };
-        file.write(columns, &self.block, position, self.block_bytes).map_err(WriteError::parquet(file.path()))?;
+        file.write(columns, &self.block, position, self.block_bytes)
+            .map_err(WriteError::parquet(file.path()))?;
         self.totals.update(columns, &self.block);
+        crate::camera::count_frames(columns, &self.block, self.n_written, &mut self.cameras);
         self.hash_block(columns);
         self.n_written += self.block.len() as u64;
         self.block.clear();
