@@ -10,6 +10,8 @@
 //! **Invariant**: this crate knows neither datasets nor tensors; what it writes is read by `gawm-ingest`.
 #![forbid(unsafe_code)]
 
+pub mod cli;
+pub mod collect;
 mod environment;
 mod exp;
 mod rng;

@@ -23,7 +23,11 @@ fn room(config: Option<&PublishedConfig>) -> TwoRoom {
     let config = config.map_or_else(TwoRoomConfig::default, |c| TwoRoomConfig {
         wall_axis: if c.axis == 1 { WallAxis::Vertical } else { WallAxis::Horizontal },
         wall_thickness_px: c.thickness,
-        doors: c.doors.iter().map(|&(center_px, half_extent_px)| Door { center_px, half_extent_px }).collect(),
+        doors: c
+            .doors
+            .iter()
+            .map(|&(center_px, half_extent_px)| Door { center_px, half_extent_px })
+            .collect(),
         agent_radius_px: c.radius,
         speed_px: c.speed,
         render_target: c.render_target,

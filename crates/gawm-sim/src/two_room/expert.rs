@@ -55,7 +55,12 @@ impl TwoRoomExpert {
 }
 
 /// The expert's direction before noise: a vector of length 1, or 0 at the waypoint itself.
-pub fn expert_direction(room: &TwoRoomConfig, door_reach_px: f32, agent: [f32; 2], target: [f32; 2]) -> [f32; 2] {
+pub fn expert_direction(
+    room: &TwoRoomConfig,
+    door_reach_px: f32,
+    agent: [f32; 2],
+    target: [f32; 2],
+) -> [f32; 2] {
     let across = room.wall_axis.across();
     let is_beyond = |p: [f32; 2]| p[across] > WALL_CENTER_PX;
     let waypoint = if is_beyond(agent) == is_beyond(target) {

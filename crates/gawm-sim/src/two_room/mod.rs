@@ -11,15 +11,17 @@ mod oracle;
 mod render;
 
 pub use config::{
-    BORDER_PX, Colors, ConfigError, DOOR_MARGIN_PX, Door, PUSHBACK_PX, SUCCESS_RADIUS_PX, TwoRoomConfig, WALL_CENTER_PX,
-    WORLD_SIZE_PX, WallAxis,
+    BORDER_PX, Colors, ConfigError, DOOR_MARGIN_PX, Door, PUSHBACK_PX, SUCCESS_RADIUS_PX, TwoRoomConfig,
+    WALL_CENTER_PX, WORLD_SIZE_PX, WallAxis,
 };
 pub use dynamics::{Geometry, distance_px};
 pub use expert::{ExpertConfig, TwoRoomExpert, expert_direction, unit_direction};
 pub use oracle::{oracle_action, straight_line_action};
 pub use render::{FRAME_SIZE, Renderer};
 
-use crate::environment::{Axis, Environment, EnvironmentError, EnvironmentSpec, Frame, State, Step, finite_pair};
+use crate::environment::{
+    Axis, Environment, EnvironmentError, EnvironmentSpec, Frame, State, Step, finite_pair,
+};
 use crate::rng::{Rng, Stream};
 
 /// Steps per simulated second.
@@ -78,6 +80,11 @@ impl TwoRoom {
     /// Returns the lengths of its physics: the true dynamics without the environment around them.
     pub fn geometry(&self) -> &Geometry {
         &self.geometry
+    }
+
+    /// Returns what draws its frames.
+    pub fn renderer(&self) -> &Renderer {
+        &self.renderer
     }
 
     /// Returns the agent's position.

@@ -43,7 +43,10 @@ fn towards(geometry: &Geometry, agent: [f32; 2], point: [f32; 2]) -> [f32; 2] {
 fn shortest_way(geometry: &Geometry, agent: [f32; 2], goal: [f32; 2]) -> Vec<[f32; 2]> {
     let agent = to_wall_frame(geometry, agent);
     let ways = reachable_ends(geometry, to_wall_frame(geometry, goal)).into_iter().flat_map(|end| {
-        let doors = geometry.passages_px.iter().filter_map(move |&passage| way_through(geometry, passage, agent, end));
+        let doors = geometry
+            .passages_px
+            .iter()
+            .filter_map(move |&passage| way_through(geometry, passage, agent, end));
         let direct = (side(geometry, agent) == side(geometry, end) && side(geometry, end) != Side::InWall)
             .then(|| vec![end]);
         doors.chain(direct)
@@ -97,14 +100,20 @@ fn wall_faces(geometry: &Geometry) -> [f32; 2] {
 }
 
 /// Returns the turning points of the shortest way through one door, or `None` when it does not lead there.
-fn way_through(geometry: &Geometry, passage: [f32; 2], agent: [f32; 2], end: [f32; 2]) -> Option<Vec<[f32; 2]>> {
+fn way_through(
+    geometry: &Geometry,
+    passage: [f32; 2],
+    agent: [f32; 2],
+    end: [f32; 2],
+) -> Option<Vec<[f32; 2]>> {
     let (agent_side, end_side) = (side(geometry, agent), side(geometry, end));
     if agent_side == end_side && agent_side != Side::InWall {
         return None;
     }
     let first = (passage[0] + PASSAGE_INSET_PX).max(geometry.room_low_px);
     let last = (passage[1] - PASSAGE_INSET_PX).min(geometry.room_high_px);
-    let leads_here = first <= last && (end_side != Side::InWall || (passage[0]..=passage[1]).contains(&end[1]));
+    let leads_here =
+        first <= last && (end_side != Side::InWall || (passage[0]..=passage[1]).contains(&end[1]));
     if !leads_here {
         return None;
     }
@@ -126,7 +135,12 @@ fn way_through(geometry: &Geometry, passage: [f32; 2], agent: [f32; 2], end: [f3
 }
 
 /// An agent in the wall beside this door is put back on its side by any step; the way begins there.
-fn leave_wall(geometry: &Geometry, passage: [f32; 2], agent: [f32; 2], end: [f32; 2]) -> Option<Vec<[f32; 2]>> {
+fn leave_wall(
+    geometry: &Geometry,
+    passage: [f32; 2],
+    agent: [f32; 2],
+    end: [f32; 2],
+) -> Option<Vec<[f32; 2]>> {
     let [low, high] = wall_faces(geometry);
     let face = [if agent[0] < WALL_CENTER_PX { low } else { high }, agent[1]];
     let mut way = vec![face];

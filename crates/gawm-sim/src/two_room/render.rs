@@ -66,7 +66,8 @@ fn draw_rooms(config: &TwoRoomConfig) -> Vec<u8> {
     let center = WALL_CENTER_PX as usize;
     let border = BORDER_PX as usize;
     let far = FRAME_SIZE - border;
-    let on_border = |i: usize| (border - BORDER_LINE_PX..border).contains(&i) || (far..far + BORDER_LINE_PX).contains(&i);
+    let on_border =
+        |i: usize| (border - BORDER_LINE_PX..border).contains(&i) || (far..far + BORDER_LINE_PX).contains(&i);
     let in_door = |along: usize| {
         config.doors.iter().any(|d| along.abs_diff(d.center_px.into()) <= d.half_extent_px.into())
     };
@@ -95,7 +96,8 @@ fn draw_rooms(config: &TwoRoomConfig) -> Vec<u8> {
 /// The weight of a pixel is its Gaussian, divided by the largest of the image: a dot beyond the edge still shows.
 fn blend_dot(rgb: &mut [u8], dot: Dot, center: [f32; 2]) {
     let table = ExpTable::get();
-    let squares = center.map(|c| std::array::from_fn::<f32, FRAME_SIZE, _>(|i| (i as f32 - c) * (i as f32 - c)));
+    let squares =
+        center.map(|c| std::array::from_fn::<f32, FRAME_SIZE, _>(|i| (i as f32 - c) * (i as f32 - c)));
     let exponent = |x: usize, y: usize| -(squares[0][x] + squares[1][y]) / dot.denominator;
     let nearest = center.map(|c| c.round().clamp(0.0, (FRAME_SIZE - 1) as f32) as usize);
     let largest_exponent = exponent(nearest[0], nearest[1]);
