@@ -8,8 +8,8 @@ use super::expert::unit_direction;
 const PASSAGE_INSET_PX: f32 = 0.5;
 /// How far before the wall the way turns.
 const WALL_CLEARANCE_PX: f32 = 0.5;
-/// A turning point nearer than this counts as reached.
-const REACHED_PX: f32 = 1.0;
+/// A turning point nearer than this counts as reached. Less than the inset, so that who reached one is in the door.
+const REACHED_PX: f32 = 0.4;
 /// Rounds of the alternating minimisation that lays a way through a door; each shrinks the error by a large factor.
 const TURNING_POINT_ROUNDS: usize = 24;
 
@@ -120,15 +120,16 @@ fn way_through(
     if agent_side == Side::InWall && !(passage[0]..=passage[1]).contains(&agent[1]) {
         return leave_wall(geometry, passage, agent, end);
     }
+    // The way turns before the wall, or where it touches the wall already.
     let [low, high] = wall_faces(geometry);
-    let mut gates: Vec<f32> = [low, high]
-        .into_iter()
-        .filter(|&gate| gate > agent[0].min(end[0]) && gate < agent[0].max(end[0]))
-        .collect();
-    if end[0] < agent[0] {
-        gates.reverse();
-    }
-    let mut way: Vec<[f32; 2]> = gates.iter().map(|&gate| [gate, (first + last) / 2.0]).collect();
+    let gate = |side, across_px: f32| match side {
+        Side::Low => Some(low.max(across_px)),
+        Side::High => Some(high.min(across_px)),
+        Side::InWall => None,
+    };
+    let gates = [gate(agent_side, agent[0]), gate(end_side, end[0])];
+    let mut way: Vec<[f32; 2]> =
+        gates.into_iter().flatten().map(|gate| [gate, (first + last) / 2.0]).collect();
     way.push(end);
     lay_through_gates(&mut way, agent, first, last);
     Some(way)
