@@ -1,4 +1,5 @@
 //! Collected logs: read back they equal the simulator's truth; equal seeds give equal bytes.
+#![expect(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 use std::collections::BTreeMap;
 use std::path::Path;

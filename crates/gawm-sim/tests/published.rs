@@ -1,4 +1,5 @@
 //! TwoRoom against what the published environment did (`fixtures/tworoom`, made by its `make.py`).
+#![expect(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 use std::path::Path;
 

@@ -1,4 +1,5 @@
 //! TwoRoom against its formulas: edges, doors, determinism, the oracle and its floors.
+#![expect(clippy::unwrap_used, reason = "a failure here is a failed test")]
 
 use gawm_sim::two_room::{
     Door, ExpertConfig, Geometry, TwoRoomExpert, WallAxis, distance_px, oracle_action, straight_line_action,
