@@ -75,7 +75,7 @@ pub mod plan;
 
 pub mod diagnostics;
 
-//pub mod checkpoint;
+pub mod checkpoint;
 
 pub mod golden;
 

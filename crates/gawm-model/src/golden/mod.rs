@@ -381,7 +381,8 @@ fn compare_gradients(golden: &Golden, gradients: &Gradients, report: &mut Report
     let global = flat(&gradients.norm()?)?[0];
     report.relative("grad_norm", &[global], &[golden.grad_norm], GRADIENT);
     for (name, reference) in &golden.grad {
-        let gradient = gradients.get(&our_name(name)).ok_or_else(|| GoldenError::missing("our gradients", name))?;
+        let gradient =
+            gradients.get(&our_name(name)).ok_or_else(|| GoldenError::missing("our gradients", name))?;
         let ours = flat(gradient)?;
         let norm = ours.iter().map(|value| value * value).sum::<f64>().sqrt();
         let allowed = GRADIENT * reference.l2 + GRADIENT_GLOBAL * golden.grad_norm;

@@ -122,7 +122,7 @@ pub const PRESETS: [&str; 10] = [
 #[derive(Debug, Clone, PartialEq)]
 pub struct Objectives {
     /// Weight of each term, in the order of [`Term::ALL`]; 0 leaves it out.
-    weights: [f64; Term::ALL.len()],
+    pub weights: [f64; Term::ALL.len()],
     /// Terms without a weight that are computed and logged all the same.
     pub monitored: Vec<Term>,
     /// What is broken on purpose.
