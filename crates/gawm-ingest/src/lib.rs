@@ -10,3 +10,4 @@ pub mod inspect;
 pub mod log;
 pub mod records;
 pub mod run;
+pub mod suggest;

@@ -3,7 +3,9 @@
 //! Results go to stdout, everything else to stderr. Exit codes: 0 clean; 1 failed, nothing usable; 2 bad arguments or
 //! contract; 3 finished, but a mapped stream lost data or an input was refused; 130 interrupted.
 
+mod inspect;
 mod run;
+mod suggest;
 mod summary;
 
 use std::ffi::OsString;
@@ -49,6 +51,10 @@ impl Global {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Show what logs hold: channels, rates, clocks, gaps, damage
+    Inspect(inspect::InspectArgs),
+    /// Write a first contract for logs, every guess with its reason
+    Suggest(suggest::SuggestArgs),
     /// Make a dataset of logs
     Run(run::RunArgs),
     /// Print a completion script for a shell
@@ -86,6 +92,8 @@ pub fn main(args: impl IntoIterator<Item = OsString>) -> ExitCode {
         }
     };
     let result = match &cli.command {
+        Command::Inspect(args) => inspect::run(args, &cli.global),
+        Command::Suggest(args) => suggest::run(args, &cli.global),
         Command::Run(args) => run::run(args, &cli.global),
         Command::Completions { shell } => {
             clap_complete::generate(*shell, &mut Cli::command(), "gawm-ingest", &mut std::io::stdout());

@@ -24,13 +24,16 @@ use gawm_schema::Schema;
 
 pub use bind::{BindError, Binding, BoundFeature, BoundStream, FeatureSource};
 pub use error::{Refusal, RunError};
+pub(crate) use picture::Picture;
+pub(crate) use plan::{Plans, schema_of};
+pub(crate) use recording::OpenRecording;
 pub use report::{FileReport, FileStatus, LostReport, Report, StreamReport, TopicReport};
 
 use crate::contract::{CheckedContract, to_toml};
 use crate::decode::SchemaLibrary;
 use crate::episodes::Labels;
 use crate::log::{Discovery, OpenOptions, Recording, discover};
-use recording::{OpenRecording, RecordingOutcome};
+use recording::RecordingOutcome;
 use report::AgeCounts;
 
 /// What to do.

@@ -12,7 +12,7 @@ use crate::decode::{ImageKind, ImageMessage};
 
 /// The image of one message: bytes that outlive their block, checked as far as that is cheap.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Picture {
+pub struct Picture {
     data: Bytes,
     header: ImageHeader,
 }
@@ -20,7 +20,7 @@ pub(crate) struct Picture {
 /// Why an image cannot be used.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub(crate) enum PictureError {
+pub enum PictureError {
     /// The bytes are no image, or only a part of one.
     #[error("image cannot be read: {0}")]
     Header(#[from] ImageHeaderError),
