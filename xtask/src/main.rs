@@ -1,2 +1,35 @@
 //! Gates as tests, golden parity, interop with other people's software.
-fn main() {}
+#![forbid(unsafe_code)]
+
+mod golden;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Tasks of this repository that are not part of any program.
+#[derive(Debug, Parser)]
+#[command(name = "xtask", version)]
+struct Arguments {
+    #[command(subcommand)]
+    task: Task,
+}
+
+#[derive(Debug, Subcommand)]
+enum Task {
+    /// Compare the model with answers of the published PyTorch modules.
+    Golden(golden::Arguments),
+}
+
+fn main() -> ExitCode {
+    let result = match Arguments::parse().task {
+        Task::Golden(arguments) => golden::run(&arguments),
+    };
+    match result {
+        Ok(code) => code,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::from(1)
+        }
+    }
+}

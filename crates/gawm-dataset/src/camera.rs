@@ -121,7 +121,7 @@ pub(crate) fn count_frames(
         let counted: Vec<CameraStats> = sampled
             .par_iter()
             .filter_map(|frame| decode(frame, &Limits::default()).ok())
-            .map(|p| count_pixels(&p))
+            .map(|image| count_pixels(&image))
             .collect();
         let stats = cameras.entry(image.name.clone()).or_default();
         counted.iter().for_each(|one| stats.merge(one));
@@ -132,7 +132,7 @@ pub(crate) fn count_frames(
 fn count_pixels(image: &Image) -> CameraStats {
     let (height, width, channels) = (image.height() as usize, image.width() as usize, image.pixels().channels());
     let step = (height.max(width) / 256).max(1);
-    let mut dense = vec![vec![0u64; 1 << 16]; channels];
+    let mut dense = vec![vec![0u64; 1 << 16]; channels.min(3)];
     for y in (0..height).step_by(step) {
         for x in (0..width).step_by(step) {
             let start = (y * width + x) * channels;
@@ -142,7 +142,7 @@ fn count_pixels(image: &Image) -> CameraStats {
                     Pixels::Gray16(values) => values[start + channel],
                     // Metres as millimetres; NaN and negative values are 0: no measurement.
                     Pixels::GrayF32(values) => (values[start + channel] * 1000.0).round() as u16,
-                    _ => 0,
+                    _ => continue,
                 };
                 counts[usize::from(value)] += 1;
             }
