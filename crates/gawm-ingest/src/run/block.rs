@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 
-use super::picture::{Picture, PictureError};
+use super::picture::{Picture, loss_reason};
 use super::plan::{ChannelPlan, Plans, Sinks, schema_of};
 use crate::decode::{CameraInfo, DecodeError, Decoded, RowSink, decode_to_json};
 use crate::log::{Block, BlockRef, Damage, Log, Message, decompress_message, looks_like_zstd};
@@ -184,7 +184,8 @@ fn fill(
     if let Some(image) = &plan.image {
         let message = image.extract(payload, &mut RowSink::new()).map_err(|error| loss_of(&error))?;
         let stamp_ns = message.stamp_ns;
-        let picture = Picture::new(&message, image.kind(), |data| whole.keep(data)).map_err(|error| picture_loss(&error))?;
+        let picture = Picture::new(&message, image.kind(), |data| whole.keep(data))
+            .map_err(|error| MessageLoss { reason: loss_reason(&error), detail: error.to_string() })?;
         out.picture = Some((picture, stamp_ns));
     }
     let topic = &plans.topics[out.topic];
@@ -200,9 +201,5 @@ fn fill(
 }
 
 fn loss_of(error: &DecodeError) -> MessageLoss {
-    MessageLoss { reason: error.reason(), detail: error.to_string() }
-}
-
-fn picture_loss(error: &PictureError) -> MessageLoss {
     MessageLoss { reason: error.reason(), detail: error.to_string() }
 }
