@@ -2,6 +2,7 @@
 #![forbid(unsafe_code)]
 
 mod golden;
+mod interop;
 
 use std::process::ExitCode;
 
@@ -19,11 +20,14 @@ struct Arguments {
 enum Task {
     /// Compare the model with answers of the published PyTorch modules.
     Golden(golden::Arguments),
+    /// Exchange files with other people's software.
+    Interop(interop::Arguments),
 }
 
 fn main() -> ExitCode {
     let result = match Arguments::parse().task {
         Task::Golden(arguments) => golden::run(&arguments),
+        Task::Interop(arguments) => interop::run(&arguments),
     };
     match result {
         Ok(code) => code,

@@ -9,6 +9,7 @@
 //!   transformers 4 or 5. A pickle is read by a machine that builds tensors and containers and refuses all else.
 //! - [`export`]: the model alone, as `safetensors.torch.load_file` and `load_state_dict` take it.
 
+mod archive;
 mod layout;
 mod pickle;
 mod safetensors;
