@@ -17,7 +17,7 @@ const MAX_PICKLE_BYTES: u64 = 16 << 20;
 #[non_exhaustive]
 pub enum TorchError {
     /// The file system or the archive refuses.
-    #[error("{0}")]
+    #[error(transparent)]
     Io(#[from] std::io::Error),
     /// The archive is damaged.
     #[error("damaged archive: {message}")]
@@ -79,7 +79,7 @@ pub enum TorchError {
         name: String,
     },
     /// candle failed.
-    #[error("tensor operation failed: {0}")]
+    #[error(transparent)]
     Candle(#[from] candle_core::Error),
 }
 

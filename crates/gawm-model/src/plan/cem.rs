@@ -112,7 +112,7 @@ pub enum PlanError {
         got: usize,
     },
     /// candle failed.
-    #[error("tensor operation failed: {0}")]
+    #[error(transparent)]
     Candle(#[from] candle_core::Error),
 }
 
