@@ -4,11 +4,12 @@ mod python;
 mod torch;
 
 use std::io::Write;
-use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::Subcommand;
+
+use crate::process::root;
 
 /// Arguments of `xtask interop`.
 #[derive(Debug, clap::Args)]
@@ -27,11 +28,6 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     match &arguments.with {
         With::Torch(arguments) => torch::run(arguments),
     }
-}
-
-/// The root of the repository.
-fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap_or(Path::new(".")).to_owned()
 }
 
 /// Appends a section to `docs/interop.md`, replacing the one of the same title.

@@ -3,16 +3,9 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use anyhow::{Context, ensure};
+use anyhow::Context;
 
-/// Runs a command and fails with its name if it does.
-pub(super) fn run(command: &mut Command) -> anyhow::Result<String> {
-    let shown = format!("{command:?}");
-    let output = command.output().with_context(|| format!("cannot run {shown}"))?;
-    let errors = String::from_utf8_lossy(&output.stderr);
-    ensure!(output.status.success(), "{shown} failed ({}):\n{errors}", output.status);
-    Ok(String::from_utf8_lossy(&output.stdout).into_owned())
-}
+use crate::process::run;
 
 /// Returns the interpreter of an environment with the packages of `requirements`, making it if needed.
 ///

@@ -9,7 +9,8 @@ use anyhow::{Context, bail, ensure};
 use gawm_model::checkpoint::{self, ImportOptions, KeyLayout};
 use gawm_model::{DType, Device, Pass, Tensor, WorldModel, plan};
 
-use super::{python, record, root};
+use super::{python, record};
+use crate::process::{root, run as run_program};
 
 /// Arguments of `xtask interop torch`.
 #[derive(Debug, clap::Args)]
@@ -33,7 +34,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         }
     };
     let script = root().join("xtask/interop/torch_world_model.py");
-    let python = |task: &str| python::run(Command::new(&interpreter).arg(&script).arg(task).arg(&folder));
+    let python = |task: &str| run_program(Command::new(&interpreter).arg(&script).arg(task).arg(&folder));
     python("make")?;
 
     let mut rows = Vec::new();
