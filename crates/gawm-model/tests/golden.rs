@@ -1,4 +1,5 @@
 //! Parity with the published PyTorch modules, on the fixtures and on every file in `GAWM_GOLDEN_DIR`.
+#![expect(clippy::unwrap_used, reason = "a test ends where its helper does")]
 
 use std::path::{Path, PathBuf};
 

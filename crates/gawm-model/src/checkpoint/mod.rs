@@ -103,7 +103,7 @@ pub enum CheckpointError {
         /// The file.
         path: PathBuf,
         /// The cause.
-        cause: TorchError,
+        cause: Box<TorchError>,
     },
     /// The file was not written by [`save`], or by another version.
     #[error(
@@ -139,7 +139,7 @@ pub enum CheckpointError {
         /// The file.
         path: PathBuf,
         /// The cause.
-        cause: ParameterError,
+        cause: Box<ParameterError>,
     },
     /// The optimiser's state does not fit.
     #[error("checkpoint {path:?}: {cause}")]
@@ -147,7 +147,7 @@ pub enum CheckpointError {
         /// The file.
         path: PathBuf,
         /// The cause.
-        cause: OptimizerError,
+        cause: Box<OptimizerError>,
     },
     /// Tensors of which no published model consists.
     #[error("cannot import {path:?}: {message}")]
@@ -253,7 +253,8 @@ fn load_optimizer(
     entry: OptimizerEntry,
     model: &WorldModel,
 ) -> Result<AdamW, CheckpointError> {
-    let refuse = |cause: OptimizerError| CheckpointError::Optimizer { path: path.to_owned(), cause };
+    let refuse =
+        |cause: OptimizerError| CheckpointError::Optimizer { path: path.to_owned(), cause: Box::new(cause) };
     let shapes: Vec<(String, Vec<usize>)> =
         file.shapes().filter(|(name, _)| name.starts_with(PREFIX_OPTIMIZER)).collect();
     let mut state = BTreeMap::new();
@@ -290,7 +291,7 @@ pub fn import(path: &Path, options: &ImportOptions, device: &Device) -> Result<W
         magic == *b"PK\x03\x04"
     };
     if is_zip {
-        let refuse = |cause| CheckpointError::Torch { path: path.to_owned(), cause };
+        let refuse = |cause| CheckpointError::Torch { path: path.to_owned(), cause: Box::new(cause) };
         let mut archive = torch::TorchFile::open(path).map_err(refuse)?;
         let shapes: Vec<(String, Vec<usize>)> = archive.shapes().collect();
         import_tensors(path, None, shapes, options, device, |name| archive.read(name).map_err(refuse))
@@ -366,7 +367,7 @@ fn fill(
     device: &Device,
     mut read: impl FnMut(&str) -> Result<Tensor, CheckpointError>,
 ) -> Result<WorldModel, CheckpointError> {
-    let refuse = |cause| CheckpointError::Parameter { path: path.to_owned(), cause };
+    let refuse = |cause| CheckpointError::Parameter { path: path.to_owned(), cause: Box::new(cause) };
     let specs: Specs = WorldModel::specs(&architecture);
     let mut names = BTreeMap::new();
     for (ours, theirs, got) in tensors {
@@ -398,7 +399,8 @@ fn finite(path: &Path, name: &str, tensor: Tensor) -> Result<Tensor, CheckpointE
     match values.iter().position(|value| !value.is_finite()) {
         None => Ok(tensor),
         Some(index) => {
-            let cause = ParameterError::NonFinite { name: name.to_owned(), index, got: values[index] };
+            let cause =
+                Box::new(ParameterError::NonFinite { name: name.to_owned(), index, got: values[index] });
             Err(CheckpointError::Parameter { path: path.to_owned(), cause })
         }
     }

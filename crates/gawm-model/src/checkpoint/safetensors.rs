@@ -70,7 +70,7 @@ pub enum FormatError {
         /// The tensor.
         name: String,
         /// Its shape.
-        shape: Vec<usize>,
+        shape: Box<[usize]>,
         /// Bytes that shape and type need; `None` beyond 64 bits.
         expected: MaybeBytes,
         /// Where it states to be.
@@ -114,9 +114,12 @@ pub(super) struct TensorFile {
     path: PathBuf,
     file: File,
     data_start: u64,
-    metadata: BTreeMap<String, String>,
-    entries: BTreeMap<String, Entry>,
+    metadata: Metadata,
+    entries: Entries,
 }
+
+type Metadata = BTreeMap<String, String>;
+type Entries = BTreeMap<String, Entry>;
 
 #[derive(Debug, Clone)]
 struct Entry {
@@ -211,10 +214,7 @@ impl TensorFile {
     }
 }
 
-fn parse_header(
-    header: &[u8],
-    data_bytes: u64,
-) -> Result<(BTreeMap<String, String>, BTreeMap<String, Entry>), FormatError> {
+fn parse_header(header: &[u8], data_bytes: u64) -> Result<(Metadata, Entries), FormatError> {
     let malformed = |error: serde_json::Error| FormatError::Header { message: error.to_string() };
     let raw: RawHeader = serde_json::from_slice(header).map_err(malformed)?;
     let mut entries = BTreeMap::new();
@@ -255,7 +255,7 @@ fn check_entry(name: &str, raw: RawEntry) -> Result<Entry, FormatError> {
     if expected.is_none() || end.checked_sub(begin) != expected {
         return Err(FormatError::Size {
             name: name.to_owned(),
-            shape: raw.shape,
+            shape: raw.shape.into(),
             expected: MaybeBytes(expected),
             offsets: raw.data_offsets,
         });

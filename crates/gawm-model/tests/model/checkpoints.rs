@@ -362,7 +362,12 @@ fn torch_files_are_imported() {
     assert_eq!(bits(&checkpoint::import(&path, &MICRO, &Device::Cpu).unwrap()), bits(&model));
     torch_file(&path, &model, zip::CompressionMethod::Deflated);
     let error = checkpoint::import(&path, &MICRO, &Device::Cpu).unwrap_err();
-    assert!(matches!(error, CheckpointError::Torch { cause: TorchError::Compressed { .. }, .. }), "{error}");
+    match error {
+        CheckpointError::Torch { cause, .. } => {
+            assert!(matches!(*cause, TorchError::Compressed { .. }), "{cause}")
+        }
+        other => panic!("{other}"),
+    }
 }
 
 #[test]
