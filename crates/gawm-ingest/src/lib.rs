@@ -1,1 +1,3 @@
 //! Raw robot and simulator logs to datasets.
+
+pub mod tabular;
