@@ -308,7 +308,7 @@ fn unshuffle_bytes(block: &[u8], size: usize, out: &mut [u8]) {
 /// A block whose element count is no multiple of 8 was copied as it is (c-blosc `bitshuffle`).
 fn unshuffle_bits(block: &[u8], size: usize, out: &mut [u8]) {
     let n = block.len() / size;
-    if n % 8 != 0 {
+    if !n.is_multiple_of(8) {
         out.copy_from_slice(block);
         return;
     }

@@ -3,10 +3,13 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 
+/// A decoded chunk: its dataset, its place in the grid, its bytes.
+type Kept = (u64, u64, Arc<Vec<u8>>);
+
 /// Decoded chunks of filters that cannot be undone in part, so that the next row does not inflate again.
 pub(crate) struct ChunkCache {
-    /// Newest last: dataset, place, data.
-    kept: Mutex<VecDeque<(u64, u64, Arc<Vec<u8>>)>>,
+    /// Newest last.
+    kept: Mutex<VecDeque<Kept>>,
     max_bytes: u64,
 }
 

@@ -7,6 +7,9 @@ use super::{ColumnRows, Episode, EpisodeEnd, Episodes, Extent, LayoutError, read
 use crate::tabular::Table;
 use crate::tabular::finding::{Finding, FindingKind};
 
+/// A column with a row per step, and how many of its rows can be read.
+type StepColumn = (Arc<str>, u64);
+
 /// Cuts the rows after every mark; what follows the last one is unfinished.
 pub(crate) fn find(
     table: &Table,
@@ -56,7 +59,7 @@ pub(crate) fn find(
 }
 
 /// Columns with a row per step, with the rows that can be read; and constants.
-fn split_columns(table: &Table, rows: u64, found: &mut Episodes) -> (Vec<(Arc<str>, u64)>, Vec<Arc<str>>) {
+fn split_columns(table: &Table, rows: u64, found: &mut Episodes) -> (Vec<StepColumn>, Vec<Arc<str>>) {
     let (mut columns, mut constants) = (Vec::new(), Vec::new());
     for column in readable(table) {
         let path: Arc<str> = Arc::from(column.path.as_str());
@@ -76,7 +79,7 @@ fn episode(
     number: u64,
     rows: std::ops::Range<u64>,
     end: EpisodeEnd,
-    columns: &[(Arc<str>, u64)],
+    columns: &[StepColumn],
     constants: &[Arc<str>],
 ) -> Episode {
     let steps = rows.end - rows.start;
