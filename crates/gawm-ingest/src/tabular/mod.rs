@@ -17,6 +17,7 @@ mod hdf5;
 mod layout;
 mod npz;
 mod raw;
+mod samples;
 
 #[cfg(test)]
 mod tests;
@@ -32,6 +33,7 @@ pub use error::{OpenTableError, ReadError};
 pub use finding::{Finding, FindingKind};
 pub use layout::{ColumnRows, Episode, EpisodeEnd, Episodes, Extent, Layout, LayoutError};
 use raw::{RawForm, RawType};
+pub use samples::{Batch, SampleError, SampleReader, Selection, StreamBatch, StreamRequest};
 
 /// Caps that a hostile file meets before memory is taken.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -65,6 +67,9 @@ impl Default for Limits {
         }
     }
 }
+
+/// What a text costs in memory besides its bytes, rounded up.
+const TEXT_BYTES: u64 = 64;
 
 /// File formats that hold tables.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
@@ -310,12 +315,18 @@ impl Table {
             Source::Hdf5(source) => source.row_bytes(at),
             Source::Npz(source) => source.row_bytes(at),
         };
-        let got = (rows.end - rows.start).saturating_mul(row_bytes);
+        let mut got = (rows.end - rows.start).saturating_mul(row_bytes);
+        if column.dtype == Dtype::Text {
+            // Every text costs an allocation, however short it is.
+            got = got.max(
+                (rows.end - rows.start).saturating_mul(column.row_elements()).saturating_mul(TEXT_BYTES),
+            );
+        }
         if got > self.limits.max_read_bytes {
             let limit = self.limits.max_read_bytes;
             return Err(ReadError::TooLarge { column: column.path.clone(), what: "read", limit, got });
         }
-        let start = out.len();
+        let (start, got) = (out.len(), (rows.end - rows.start) * row_bytes);
         match &self.opened.source {
             Source::Hdf5(source) => source.read(at, &column.path, rows, out)?,
             Source::Npz(source) => source.read(at, &column.path, rows, out)?,
@@ -343,7 +354,9 @@ impl Table {
         if row_bytes == 0 {
             return Ok(());
         }
-        let batch = batch.min(self.limits.max_read_bytes / row_bytes).max(1);
+        let cost =
+            if raw.dtype == Dtype::Text { column.row_elements().saturating_mul(TEXT_BYTES) } else { 0 };
+        let batch = batch.min(self.limits.max_read_bytes / row_bytes.max(cost)).max(1);
         let mut start = 0;
         while start < column.readable_rows {
             let end = start.saturating_add(batch).min(column.readable_rows);

@@ -40,12 +40,15 @@ pub(crate) struct Grid<'a> {
     pub(crate) max_chunks: u64,
 }
 
-/// The chunks of one dataset, row-major over the grid of chunks.
+/// The chunks of one dataset, by their place in the grid of chunks, row-major.
 #[derive(Debug)]
 pub(crate) struct ChunkIndex {
-    chunks: Vec<Chunk>,
+    /// The chunks that are stored, in order; a damaged extent cannot make this large.
+    chunks: Vec<(u64, Chunk)>,
     /// Chunks along every axis.
     pub(crate) counts: Vec<u64>,
+    /// Chunks of the whole grid.
+    total: u64,
 }
 
 impl ChunkIndex {
@@ -56,61 +59,59 @@ impl ChunkIndex {
         indexing: Option<&ChunkIndexing>,
         grid: &Grid<'_>,
     ) -> Result<Self> {
-        let counts: Vec<u64> =
-            grid.shape.iter().zip(grid.chunk_shape).map(|(&n, &c)| n.div_ceil(u64::from(c.max(1)))).collect();
+        let count = |(&n, &c): (&u64, &u32)| n.div_ceil(u64::from(c.max(1)));
+        let counts: Vec<u64> = grid.shape.iter().zip(grid.chunk_shape).map(count).collect();
         let total = counts.iter().try_fold(1u64, |n, &c| n.checked_mul(c)).filter(|&n| n <= grid.max_chunks);
-        let Some(total) = total.and_then(|n| usize::try_from(n).ok()) else {
+        let Some(total) = total else {
             return Err(Error::ResourceLimit(format!(
                 "grid of {counts:?} chunks, limit {}",
                 grid.max_chunks
             )));
         };
-        let mut index = Self { chunks: vec![Chunk::ABSENT; total], counts };
-        let offset_size = file.superblock().offset_size;
-        if total == 0 || Cursor::is_undefined_offset(address, offset_size) {
+        let mut index = Self { chunks: Vec::new(), counts, total };
+        if total == 0 || Cursor::is_undefined_offset(address, file.superblock().offset_size) {
             return Ok(index);
         }
         for entry in entries(file, address, indexing, grid)? {
-            index.insert(&entry, grid)?;
+            if let Some(place) = index.place(&entry, grid)? {
+                let chunk =
+                    Chunk { address: entry.address, bytes: entry.size, filter_mask: entry.filter_mask };
+                index.chunks.push((place, chunk));
+            }
+        }
+        index.chunks.sort_unstable_by_key(|(place, chunk)| (*place, chunk.address));
+        if let Some(twice) = index.chunks.windows(2).find(|w| w[0].0 == w[1].0) {
+            let (a, b) = (twice[0].1.address, twice[1].1.address);
+            return Err(Error::InvalidData(format!(
+                "two chunks at place {}: at {a:#x} and at {b:#x}",
+                twice[0].0
+            )));
         }
         Ok(index)
     }
 
-    fn insert(&mut self, entry: &ChunkEntry, grid: &Grid<'_>) -> Result<()> {
+    /// Returns where a chunk belongs; nowhere when it lies beyond the end of a dataset that was shrunk.
+    fn place(&self, entry: &ChunkEntry, grid: &Grid<'_>) -> Result<Option<u64>> {
         let at = &entry.offsets;
-        if at.len() != grid.shape.len()
-            || at.iter().zip(grid.chunk_shape).any(|(&o, &c)| o % u64::from(c.max(1)) != 0)
-        {
+        let is_off_grid = at.iter().zip(grid.chunk_shape).any(|(&o, &c)| o % u64::from(c.max(1)) != 0);
+        if at.len() != grid.shape.len() || is_off_grid {
             return Err(Error::InvalidData(format!(
                 "chunk at {at:?} is off the grid of {:?}",
                 grid.chunk_shape
             )));
         }
         if at.iter().zip(grid.shape).any(|(o, n)| o >= n) {
-            // A dataset that was shrunk keeps its old chunks beyond its end.
-            return Ok(());
+            return Ok(None);
         }
-        let place =
-            at.iter().zip(grid.chunk_shape).zip(&self.counts).fold(0, |n: u64, ((&o, &c), &count)| {
-                n.saturating_mul(count).saturating_add(o / u64::from(c.max(1)))
-            });
-        let slot = usize::try_from(place).ok().and_then(|p| self.chunks.get_mut(p));
-        let Some(slot) = slot else {
-            return Err(Error::InvalidData(format!("chunk at {at:?} is outside the dataset")));
-        };
-        if slot.is_present() {
-            return Err(Error::InvalidData(format!(
-                "two chunks at {at:?}: at {:#x} and at {:#x}",
-                slot.address, entry.address
-            )));
-        }
-        *slot = Chunk { address: entry.address, bytes: entry.size, filter_mask: entry.filter_mask };
-        Ok(())
+        // Cannot overflow: every factor is below its count, and the counts' product was checked.
+        let places = at.iter().zip(grid.chunk_shape).map(|(&o, &c)| o / u64::from(c.max(1)));
+        Ok(Some(places.zip(&self.counts).fold(0, |n, (place, &count)| n * count + place)))
     }
 
-    /// Returns the chunk at a place of the grid, row-major.
+    /// Returns the chunk at a place of the grid, row-major; `None` outside of the grid.
     pub(crate) fn get(&self, place: u64) -> Option<Chunk> {
-        usize::try_from(place).ok().and_then(|p| self.chunks.get(p)).copied()
+        let found = self.chunks.binary_search_by_key(&place, |(p, _)| *p);
+        (place < self.total).then(|| found.map_or(Chunk::ABSENT, |at| self.chunks[at].1))
     }
 
     /// Returns how many chunks share one place along the first axis.

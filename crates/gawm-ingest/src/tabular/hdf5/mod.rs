@@ -35,6 +35,8 @@ use super::{Limits, Opened, Source};
 
 /// A stored extent may exceed the file this many times over (deflate reaches 1032, empty images more).
 const MAX_EXPANSION: u64 = 16_384;
+/// An element may have this many bytes; only texts of fixed length come near.
+const MAX_ITEM_BYTES: usize = 1 << 20;
 /// An extent below this is never refused for its expansion.
 const FREE_EXPANSION_BYTES: u64 = 1 << 30;
 
@@ -167,6 +169,8 @@ struct Walk<'a> {
     findings: Vec<Finding>,
     /// Object headers of groups seen, against hard links that form a cycle.
     visited: BTreeSet<u64>,
+    /// Object headers of datasets seen: only the first of several names carries the attributes.
+    described: BTreeSet<u64>,
     is_unclean: bool,
     is_truncated: bool,
 }
@@ -181,6 +185,7 @@ impl<'a> Walk<'a> {
             groups: BTreeMap::new(),
             findings: Vec::new(),
             visited: BTreeSet::new(),
+            described: BTreeSet::new(),
             is_unclean: false,
             is_truncated: false,
         }
@@ -223,7 +228,13 @@ impl<'a> Walk<'a> {
             self.group_attributes(&group, &prefix);
             for (name, link) in links {
                 let place = if prefix.is_empty() { name.clone() } else { format!("{prefix}/{name}") };
-                let Some(child) = self.follow(&group, &name, &link, &place) else { continue };
+                let child = self.follow(&group, &name, &link, &place);
+                if (self.columns.len() + self.findings.len() + self.visited.len()) as u64
+                    > self.limits.max_columns
+                {
+                    return Err(too_many(path, "datasets", self.limits.max_columns));
+                }
+                let Some(child) = child else { continue };
                 if depth >= self.limits.max_depth {
                     return Err(too_many(path, "levels of groups", u64::from(self.limits.max_depth)));
                 }
@@ -235,10 +246,6 @@ impl<'a> Walk<'a> {
                         format!("the group cannot be listed: {e}"),
                     ),
                 }
-            }
-            let n_objects = self.columns.len() + self.findings.len() + pending.len();
-            if n_objects as u64 > self.limits.max_columns {
-                return Err(too_many(path, "datasets", self.limits.max_columns));
             }
         }
         Ok(())
@@ -327,7 +334,11 @@ impl<'a> Walk<'a> {
             shape: metadata::shape(&dataset),
             chunk_shape: dataset.chunks().map(|c| c.iter().map(|&c| u64::from(c)).collect()),
             filters: Vec::new(),
-            attributes: metadata::attributes(&dataset.attributes()),
+            attributes: if self.described.insert(dataset.address()) {
+                metadata::attributes(&dataset.attributes())
+            } else {
+                Vec::new()
+            },
             readable_rows: 0,
             problem: None,
         };
@@ -395,6 +406,10 @@ impl<'a> Walk<'a> {
 
     /// Refuses an extent that so small a file cannot hold, so that reading it all ends.
     fn check_extent(&self, column: &Column, raw: RawType) -> Result<(), ReadError> {
+        if raw.item_bytes > MAX_ITEM_BYTES {
+            let (limit, got) = (MAX_ITEM_BYTES as u64, raw.item_bytes as u64);
+            return Err(ReadError::TooLarge { column: column.path.clone(), what: "element", limit, got });
+        }
         let got = column.shape.iter().fold(raw.item_bytes as u64, |n, &d| n.saturating_mul(d));
         let limit = self.file_bytes.saturating_mul(MAX_EXPANSION).saturating_add(FREE_EXPANSION_BYTES);
         if got > limit {

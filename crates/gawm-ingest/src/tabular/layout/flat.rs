@@ -5,7 +5,9 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use super::named::cut;
-use super::{ColumnRows, Episode, EpisodeEnd, Episodes, Extent, LayoutError, read_integers, readable};
+use super::{
+    ColumnRows, Episode, EpisodeEnd, Episodes, Extent, LayoutError, check_count, read_integers, readable,
+};
 use crate::tabular::Table;
 use crate::tabular::finding::{Finding, FindingKind};
 
@@ -40,6 +42,8 @@ pub(crate) fn find(table: &Table, index: &IndexColumns<'_>, found: &mut Episodes
         note(found, FindingKind::InconsistentIndex, index.lengths, detail);
     }
     let parts = split_columns(table, index, lengths.len().min(offsets.len()) as u64, found);
+    let n_columns = parts.steps.len() + parts.per_episode.len() + parts.constants.len();
+    check_count(lengths.len(), n_columns)?;
     let mut listed_end = 0;
     for (number, (&length, &offset)) in lengths.iter().zip(&offsets).enumerate() {
         let rows = u64::try_from(offset).ok().zip(u64::try_from(length).ok());
@@ -166,6 +170,9 @@ fn check_rows(table: &Table, index: &IndexColumns<'_>, found: &mut Episodes) -> 
         None => Ok(None),
     };
     let (numbers, steps) = (read(index.episode)?, read(index.step)?);
+    if numbers.is_none() && steps.is_none() {
+        return Ok(());
+    }
     let mut notes = Vec::new();
     for episode in found.episodes.iter().chain(&found.unfinished) {
         let (Some(number), Some(start)) =
@@ -220,6 +227,11 @@ fn unlisted_rows(
         Some(path) => read_integers(table, path)?,
         None => Vec::new(),
     };
+    if numbers.is_empty() {
+        let next = (found.episodes.len() + found.unfinished.len()) as u64;
+        push(next, listed_end..rows, EpisodeEnd::Open, parts, found);
+        return Ok(());
+    }
     let mut start = listed_end;
     for row in listed_end + 1..=rows {
         let number = |row: u64| numbers.get(row as usize).copied();
@@ -227,6 +239,7 @@ fn unlisted_rows(
             let named = number(start).and_then(|n| u64::try_from(n).ok());
             let named = named.unwrap_or((found.episodes.len() + found.unfinished.len()) as u64);
             push(named, start..row, EpisodeEnd::Open, parts, found);
+            check_count(found.unfinished.len(), parts.steps.len() + parts.constants.len())?;
             start = row;
         }
     }

@@ -243,6 +243,14 @@ pub enum LayoutError {
         /// What was expected and found.
         detail: String,
     },
+    /// More episodes than a recording has.
+    #[error("too many episodes: expected at most {limit} episodes times columns, got {got}")]
+    TooMany {
+        /// The limit.
+        limit: u64,
+        /// What the file says.
+        got: u64,
+    },
     /// A column that says where episodes begin cannot be read.
     #[error(transparent)]
     Read(#[from] ReadError),
@@ -257,7 +265,7 @@ impl LayoutError {
             Self::Unknown { .. } => Some(
                 "state the layout in the contract, for example layout = { kind = \"single\", steps = \"actions\" }",
             ),
-            Self::NoColumns | Self::DoesNotFit { .. } => None,
+            Self::NoColumns | Self::DoesNotFit { .. } | Self::TooMany { .. } => None,
         }
     }
 }
@@ -299,6 +307,13 @@ pub(crate) fn episodes(table: &Table, stated: Option<&Layout>) -> Result<Episode
 /// Columns whose values can be read.
 fn readable(table: &Table) -> impl Iterator<Item = &Column> {
     table.columns().iter().filter(|c| c.problem.is_none())
+}
+
+/// Refuses an index of more episodes than memory should be spent on; a tiny file can claim billions.
+fn check_count(episodes: usize, columns: usize) -> Result<(), LayoutError> {
+    const LIMIT: u64 = 16 << 20;
+    let got = (episodes as u64).saturating_mul(columns.max(1) as u64);
+    if got > LIMIT { Err(LayoutError::TooMany { limit: LIMIT, got }) } else { Ok(()) }
 }
 
 /// Returns whether a column's last name says that it holds actions.

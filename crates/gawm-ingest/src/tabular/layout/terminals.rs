@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use super::{ColumnRows, Episode, EpisodeEnd, Episodes, Extent, LayoutError, read_integers, readable};
+use super::{
+    ColumnRows, Episode, EpisodeEnd, Episodes, Extent, LayoutError, check_count, read_integers, readable,
+};
 use crate::tabular::Table;
 use crate::tabular::finding::{Finding, FindingKind};
 
@@ -34,6 +36,9 @@ pub(crate) fn find(
         let detail = format!("{rows} of {n_stored} rows are in the file");
         found.findings.push(Finding::new(FindingKind::EpisodeCut, terminals, detail));
     }
+    let n_marks =
+        (0..ends.len()).filter(|&at| ends[at] != 0 || stops.get(at).is_some_and(|&s| s != 0)).count();
+    check_count(n_marks, columns.len() + constants.len())?;
     let mut start = 0;
     for row in 0..rows {
         let at = row as usize;

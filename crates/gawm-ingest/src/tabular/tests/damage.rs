@@ -164,6 +164,23 @@ fn files_of_other_formats_are_refused_by_name() {
     assert!(matches!(open(Path::new("/nowhere/x.h5"), &Limits::default()), Err(OpenTableError::Io { .. })));
 }
 
+/// Extents that were never written cost nothing to claim, and must cost nothing to meet.
+#[test]
+fn claims_of_great_size_are_refused() {
+    let table = open_fixture("claims.h5");
+    let of = |path: &str| table.read_rows(path, 0..table.column(path).unwrap().readable_rows);
+    assert!(matches!(of("huge"), Err(ReadError::TooLarge { what: "extent", .. })));
+    assert!(matches!(of("long_text"), Err(ReadError::TooLarge { what: "element", .. })));
+    assert!(matches!(of("texts"), Err(ReadError::TooLarge { what: "read", .. })));
+    assert!(matches!(of("many_chunks"), Err(ReadError::Damaged { .. })));
+    assert_eq!(of("no_width").unwrap().values.len(), 0);
+    assert!(table.content_hash("no_width").is_ok());
+    assert_eq!(table.read_rows("x0", 4_194_303..4_194_304).unwrap().values, Values::F32(vec![1.0]));
+    assert!(matches!(table.episodes(None), Err(LayoutError::TooMany { .. })));
+    let marked = Layout::Terminals { terminals: "terminals".to_owned(), timeouts: None };
+    assert!(matches!(table.episodes(Some(&marked)), Err(LayoutError::TooMany { .. })));
+}
+
 /// A zip that says 4 GB in 4 MB is refused before it is inflated, and one that lies about it soon after.
 #[test]
 fn bombs_are_refused() {
