@@ -17,6 +17,7 @@ mod hdf5;
 mod layout;
 mod npz;
 mod raw;
+mod report;
 mod samples;
 
 #[cfg(test)]
@@ -33,6 +34,7 @@ pub use error::{OpenTableError, ReadError};
 pub use finding::{Finding, FindingKind};
 pub use layout::{ColumnRows, Episode, EpisodeEnd, Episodes, Extent, Layout, LayoutError};
 use raw::{RawForm, RawType};
+pub use report::{ColumnReport, TableReport, report};
 pub use samples::{Batch, SampleError, SampleReader, Selection, StreamBatch, StreamRequest};
 
 /// Caps that a hostile file meets before memory is taken.
