@@ -210,9 +210,7 @@ impl ReadError {
 
 fn filter_hint(id: u16) -> &'static str {
     match id {
-        32000 => {
-            "rewrite with compression=\"gzip\" through h5py, which has LZF built in"
-        }
+        32000 => "rewrite with compression=\"gzip\" through h5py, which has LZF built in",
         _ => "rewrite with gzip where the plugin is installed: `h5repack -f GZIP=4 in.h5 out.h5`",
     }
 }

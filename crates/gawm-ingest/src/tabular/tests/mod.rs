@@ -1,6 +1,7 @@
 mod corpora;
 mod damage;
 mod fixtures;
+mod recording;
 mod samples;
 
 use std::path::{Path, PathBuf};
