@@ -35,7 +35,7 @@ pub use error::{OpenTableError, ReadError};
 pub use finding::{Finding, FindingKind};
 pub use layout::{ColumnRows, Episode, EpisodeEnd, Episodes, Extent, Layout, LayoutError};
 use raw::{RawForm, RawType};
-pub use recording::{EPISODE_GAP_NS, RecordingError, TableBlock, TableRecording};
+pub use recording::{EPISODE_GAP_NS, RecordingError, TableRecording};
 pub use report::{ColumnReport, TableReport, report};
 pub use samples::{Batch, SampleError, SampleReader, Selection, StreamBatch, StreamRequest};
 

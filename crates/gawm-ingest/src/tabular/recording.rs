@@ -22,9 +22,10 @@ use bytes::Bytes;
 
 use super::column::{AttributeValue, Column, Dtype, Values};
 use super::error::ReadError;
+use super::finding::{Finding, FindingKind};
 use super::raw;
 use super::{Episode, Episodes, Extent, LayoutError, Table};
-use crate::log::{Block, Channel, Damage, DamageKind, Message, MetadataRecord, Schema};
+use crate::log::{Block, BlockRef, Channel, Damage, DamageKind, Message, MetadataRecord, Schema};
 
 /// Time between two episodes: above the largest `max_gap_s` of a contract, an hour.
 pub const EPISODE_GAP_NS: i64 = 2 * 3_600 * 1_000_000_000;
@@ -66,22 +67,19 @@ pub struct TableRecording {
     starts_ns: Vec<i64>,
     channels: Vec<Arc<Channel>>,
     metadata: Vec<MetadataRecord>,
+    damage: Vec<Damage>,
     selected: BTreeSet<String>,
+    spans: Vec<Span>,
+    blocks: Vec<BlockRef>,
 }
 
-/// Rows of one episode.
+/// Rows of one episode: what a block holds.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct TableBlock {
+struct Span {
     /// Index of the episode.
-    pub episode: usize,
+    episode: usize,
     /// Its rows.
-    pub rows: Range<u64>,
-    /// Time of the first row.
-    pub start_ns: i64,
-    /// Time of the last row.
-    pub end_ns: i64,
-    /// Bytes that the block holds once read: what a memory budget should count.
-    pub uncompressed_bytes: u64,
+    rows: Range<u64>,
 }
 
 impl TableRecording {
@@ -111,8 +109,13 @@ impl TableRecording {
             selected: channels.iter().map(|c| c.topic.clone()).collect(),
             channels,
             metadata: Vec::new(),
+            damage: Vec::new(),
+            spans: Vec::new(),
+            blocks: Vec::new(),
         };
+        recording.damage = recording.findings().filter_map(damage_of).collect();
         recording.place_episodes()?;
+        recording.list_blocks();
         Ok(recording)
     }
 
@@ -156,14 +159,39 @@ impl TableRecording {
         &self.metadata
     }
 
+    /// Returns what was noticed about the file and its episodes.
+    pub fn findings(&self) -> impl Iterator<Item = &Finding> {
+        self.table.findings().iter().chain(&self.found.findings)
+    }
+
+    /// Returns the findings that mean loss or doubt, in the terms of logs.
+    pub fn damage(&self) -> &[Damage] {
+        &self.damage
+    }
+
+    /// Hashes the file's bytes with BLAKE3.
+    ///
+    /// # Errors
+    /// The operating system fails to read it.
+    pub fn content_hash(&self) -> std::io::Result<[u8; 32]> {
+        let mut hasher = blake3::Hasher::new();
+        std::io::copy(&mut std::fs::File::open(self.table.path())?, &mut hasher)?;
+        Ok(*hasher.finalize().as_bytes())
+    }
+
     /// Reads these columns only from now on, so that images nobody asked for are not decoded.
     pub fn select(&mut self, topics: impl IntoIterator<Item = String>) {
         self.selected = topics.into_iter().collect();
+        self.list_blocks();
     }
 
-    /// Lists the blocks in order of time.
-    pub fn blocks(&self) -> Vec<TableBlock> {
-        let mut blocks = Vec::new();
+    /// Returns the blocks in order of time.
+    pub fn blocks(&self) -> &[BlockRef] {
+        &self.blocks
+    }
+
+    fn list_blocks(&mut self) {
+        let (mut spans, mut blocks) = (Vec::new(), Vec::new());
         for (index, episode) in self.found.episodes.iter().enumerate() {
             let row_bytes = self.row_bytes(episode).max(1);
             let step = (BLOCK_BYTES / row_bytes).clamp(1, 4096);
@@ -171,17 +199,14 @@ impl TableRecording {
             let mut start = 0;
             while start < n_rows {
                 let end = (start + step).min(n_rows);
-                blocks.push(TableBlock {
-                    episode: index,
-                    rows: start..end,
-                    start_ns: self.time_ns(index, start),
-                    end_ns: self.time_ns(index, end - 1),
-                    uncompressed_bytes: (end - start).saturating_mul(row_bytes),
-                });
+                let time = |row| u64::try_from(self.time_ns(index, row)).ok();
+                let bytes = (end - start).saturating_mul(row_bytes);
+                blocks.push(BlockRef::of_table(blocks.len() as u64, bytes, time(start), time(end - 1)));
+                spans.push(Span { episode: index, rows: start..end });
                 start = end;
             }
         }
-        blocks
+        (self.spans, self.blocks) = (spans, blocks);
     }
 
     fn row_bytes(&self, episode: &Episode) -> u64 {
@@ -196,9 +221,12 @@ impl TableRecording {
     }
 
     /// Reads a block: never fails; what was lost is in its damage. Blocks may be read from many threads.
-    pub fn read_block(&self, block: &TableBlock) -> Block {
+    pub fn read_block(&self, block: &BlockRef) -> Block {
         let mut out = Block::default();
-        let Some(episode) = self.found.episodes.get(block.episode) else { return out };
+        let span = usize::try_from(block.offset).ok().and_then(|at| self.spans.get(at));
+        let Some((block, episode)) = span.and_then(|s| Some((s, self.found.episodes.get(s.episode)?))) else {
+            return out;
+        };
         let (mut data, mut messages) = (Vec::new(), Vec::new());
         for channel in self.channels.iter().filter(|c| self.selected.contains(&c.topic)) {
             let Some(at) = episode.columns.get(channel.topic.as_str()).filter(|at| at.extent.has_steps())
@@ -237,6 +265,20 @@ impl TableRecording {
         out.data = Bytes::from(data);
         out
     }
+}
+
+/// Says a finding in the terms of logs; what concerns columns that nobody may ask for is no damage of the file.
+fn damage_of(finding: &Finding) -> Option<Damage> {
+    let kind = match finding.kind {
+        FindingKind::Truncated | FindingKind::UnflushedRows | FindingKind::EpisodeCut => {
+            DamageKind::Truncated
+        }
+        FindingKind::UncleanClose => DamageKind::MissingFooter,
+        FindingKind::BrokenObject => DamageKind::RecordMalformed,
+        FindingKind::InconsistentIndex => DamageKind::IndexMismatch,
+        _ => return None,
+    };
+    Some(Damage { kind, offset: 0, detail: format!("{}: {}", finding.place, finding.detail) })
 }
 
 /// The final observation is a row too.

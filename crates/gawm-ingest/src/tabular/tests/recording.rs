@@ -24,12 +24,13 @@ fn decode(recording: &TableRecording, topic: &str, field: &str) -> Vec<(u64, Vec
     let field: FieldPath = field.parse().unwrap();
     let mut all = Vec::new();
     for block in recording.blocks() {
-        let read = recording.read_block(&block);
+        let read = recording.read_block(block);
         assert_eq!(read.damage, []);
         for message in &read.messages {
             let channel = read.channel(message);
             if channel.topic == topic {
-                let plan = DecodePlan::compile(&schema_of(channel), &[field.clone()], &library).unwrap();
+                let plan =
+                    DecodePlan::compile(&schema_of(channel), std::slice::from_ref(&field), &library).unwrap();
                 let mut sink = RowSink::new();
                 plan.decode(read.payload(message), &mut sink).unwrap();
                 assert_eq!(message.log_time_ns, message.publish_time_ns);
@@ -62,6 +63,10 @@ fn columns_are_topics_and_rows_are_messages() {
     assert_eq!(of("start_ns")[1], (2 * start + 1_100_000_000).to_string());
     assert_eq!(of("end_ns")[0], (start + 1_100_000_000).to_string());
     assert_eq!(recording.episodes().unfinished.len(), 1);
+    assert_eq!(
+        recording.damage().iter().map(|d| d.kind).collect::<Vec<_>>(),
+        [crate::log::DamageKind::MissingFooter]
+    );
 }
 
 #[test]
@@ -72,7 +77,7 @@ fn images_are_raw_images() {
     let mut n = 0;
     let mut expected = Vec::new();
     for block in recording.blocks() {
-        let read = recording.read_block(&block);
+        let read = recording.read_block(block);
         for message in &read.messages {
             let channel = read.channel(message);
             assert_eq!(channel.topic, "pixels");
@@ -112,7 +117,7 @@ fn texts_are_strings() {
     let library = SchemaLibrary::builtin();
     let mut texts = BTreeMap::new();
     for block in recording.blocks() {
-        let read = recording.read_block(&block);
+        let read = recording.read_block(block);
         for message in read.messages.iter().filter(|m| read.channel(m).topic == "text") {
             let schema = schema_of(read.channel(message));
             let plan = DecodePlan::compile(&schema, &["data".parse().unwrap()], &library).unwrap();
