@@ -43,7 +43,7 @@ impl Default for Samples {
 
 impl Samples {
     pub(super) fn add(&mut self, earlier_ns: i64, later_ns: i64) {
-        if self.n_seen % self.every == 0 {
+        if self.n_seen.is_multiple_of(self.every) {
             if self.pairs.len() == MAX_SAMPLES {
                 let mut n = 0;
                 self.pairs.retain(|_| {
@@ -52,7 +52,7 @@ impl Samples {
                 });
                 self.every *= 2;
             }
-            if self.n_seen % self.every == 0 {
+            if self.n_seen.is_multiple_of(self.every) {
                 self.pairs.push((earlier_ns, later_ns.saturating_sub(earlier_ns)));
             }
         }

@@ -371,7 +371,7 @@ impl<'a> BlockParser<'a> {
     fn parse(&mut self, data: &Bytes) {
         self.data = data.clone();
         let mut records = Records::new(data);
-        while let Some(record) = records.next() {
+        for record in records.by_ref() {
             self.record(record);
         }
         let rest = records.rest();

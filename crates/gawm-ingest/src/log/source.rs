@@ -67,13 +67,15 @@ const WINDOW_MAX: u64 = 1 << 20;
 pub(crate) struct Window<'a> {
     source: &'a Source,
     start: u64,
-    bytes: Bytes,
+    /// The buffer, of which the first `n_valid` bytes are the source's.
+    bytes: Vec<u8>,
+    n_valid: usize,
     next_length: u64,
 }
 
 impl<'a> Window<'a> {
     pub(crate) fn new(source: &'a Source) -> Self {
-        Self { source, start: 0, bytes: Bytes::new(), next_length: WINDOW_MIN }
+        Self { source, start: 0, bytes: Vec::new(), n_valid: 0, next_length: WINDOW_MIN }
     }
 
     /// Returns `length` bytes at `offset`, or fewer when the source ends before; the caller has capped `length`.
@@ -82,17 +84,21 @@ impl<'a> Window<'a> {
         if length == 0 {
             return Ok(&[]);
         }
-        let end = self.start + self.bytes.len() as u64;
+        let end = self.start + self.n_valid as u64;
         if offset < self.start || offset + length > end {
             let in_sequence = offset >= self.start && offset <= end;
             self.next_length = if in_sequence { (self.next_length * 2).min(WINDOW_MAX) } else { WINDOW_MIN };
             let wanted = length.max(self.next_length).min(self.source.len().saturating_sub(offset));
             let wanted = usize::try_from(wanted).map_err(io::Error::other)?;
-            self.bytes = self.source.read(offset, wanted)?;
-            self.start = offset;
+            if self.bytes.len() < wanted {
+                self.bytes.resize(wanted, 0);
+            }
+            self.n_valid = 0;
+            self.source.read_into(offset, &mut self.bytes[..wanted])?;
+            (self.start, self.n_valid) = (offset, wanted);
         }
         let from = usize::try_from(offset - self.start).map_err(io::Error::other)?;
         let until = from + usize::try_from(length).map_err(io::Error::other)?;
-        Ok(&self.bytes[from..until.min(self.bytes.len())])
+        Ok(&self.bytes[from..until.min(self.n_valid)])
     }
 }

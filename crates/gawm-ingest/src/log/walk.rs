@@ -157,12 +157,12 @@ impl<'a> Walk<'a> {
 
     /// Searches for the next record after damage at `at`; `weak` is the start of a record before it that may be to blame.
     fn recover(&mut self, at: u64, weak: Option<u64>, to: u64) -> io::Result<Option<u64>> {
-        if let Some(start) = weak {
-            if let Some(next) = self.resync(start + 1, at)? {
-                self.drop_last_message(start);
-                self.skipped(start, next, "the record's length is damaged");
-                return Ok(Some(next));
-            }
+        if let Some(start) = weak
+            && let Some(next) = self.resync(start + 1, at)?
+        {
+            self.drop_last_message(start);
+            self.skipped(start, next, "the record's length is damaged");
+            return Ok(Some(next));
         }
         let next = self.resync(at + 1, to)?;
         match next {

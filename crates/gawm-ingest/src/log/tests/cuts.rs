@@ -112,7 +112,7 @@ fn overwritten_and_moved_bytes_are_survived() {
                 0 => damaged[from..to].fill(0),
                 1 => damaged[from..to].fill(0xff),
                 2 => drop(damaged.drain(from..to)),
-                _ => drop(damaged.splice(from..from, bytes[from..to].iter().copied().collect::<Vec<u8>>())),
+                _ => drop(damaged.splice(from..from, bytes[from..to].to_vec())),
             }
             n_readable(&damaged);
         }

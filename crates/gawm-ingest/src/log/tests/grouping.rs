@@ -69,7 +69,7 @@ fn a_folder_with_metadata_is_one_recording_in_its_order() {
         ("run/other.mcap", ""),
     ]);
     let run = folder.path().join("run");
-    assert_eq!(recordings(&[run.clone()]), ["run: b.mcap a.mcap"]);
+    assert_eq!(recordings(std::slice::from_ref(&run)), ["run: b.mcap a.mcap"]);
     assert_eq!(recordings(&[folder.path().into()]), ["run: b.mcap a.mcap"]);
     assert_eq!(recordings(&[run.join("metadata.yaml")]), ["run: b.mcap a.mcap"]);
     // All parts by name are the recording again, one part is a file.
