@@ -276,6 +276,7 @@ fn damage_of(finding: &Finding) -> Option<Damage> {
         FindingKind::UncleanClose => DamageKind::MissingFooter,
         FindingKind::BrokenObject => DamageKind::RecordMalformed,
         FindingKind::InconsistentIndex => DamageKind::IndexMismatch,
+        FindingKind::UnfinishedTail => DamageKind::IndexIncomplete,
         _ => return None,
     };
     Some(Damage { kind, offset: 0, detail: format!("{}: {}", finding.place, finding.detail) })

@@ -2,6 +2,7 @@ mod corpora;
 mod damage;
 mod fixtures;
 mod recording;
+mod run;
 mod samples;
 
 use std::path::{Path, PathBuf};

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::super::recording::{EPISODE_GAP_NS, RecordingError, TableRecording};
 use super::*;
 use crate::decode::{ChannelSchema, DecodePlan, FieldPath, ImagePlan, RowSink, SchemaLibrary, Value};
-use crate::log::Channel;
+use crate::log::{Channel, DamageKind};
 
 fn schema_of(channel: &Channel) -> ChannelSchema<'_> {
     let schema = channel.schema.as_deref().unwrap();
@@ -65,7 +65,7 @@ fn columns_are_topics_and_rows_are_messages() {
     assert_eq!(recording.episodes().unfinished.len(), 1);
     assert_eq!(
         recording.damage().iter().map(|d| d.kind).collect::<Vec<_>>(),
-        [crate::log::DamageKind::MissingFooter]
+        [DamageKind::MissingFooter, DamageKind::IndexIncomplete]
     );
 }
 
