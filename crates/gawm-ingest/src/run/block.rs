@@ -9,7 +9,7 @@ use bytes::Bytes;
 use super::picture::{Picture, loss_reason};
 use super::plan::{ChannelPlan, Plans, Sinks, schema_of};
 use crate::decode::{CameraInfo, DecodeError, Decoded, RowSink, decode_to_json};
-use crate::log::{Block, BlockRef, Damage, Log, Message, decompress_message, looks_like_zstd};
+use crate::log::{Block, Damage, Message, decompress_message, looks_like_zstd};
 
 /// Largest message that a compressed message may become.
 const MAX_MESSAGE_BYTES: u64 = 1 << 30;
@@ -56,9 +56,8 @@ pub(crate) struct MessageLoss {
     pub(crate) detail: String,
 }
 
-/// Reads and decodes a block.
-pub(crate) fn decode_block(log: &Log, block: &BlockRef, plans: &Plans) -> DecodedBlock {
-    let read = log.read_block(block);
+/// Decodes a block.
+pub(crate) fn decode_block(read: Block, plans: &Plans) -> DecodedBlock {
     let mut out = DecodedBlock::default();
     let by_channel: Vec<Arc<ChannelPlan>> = read.channels.iter().map(|channel| plans.of(channel)).collect();
     let mut sinks: Vec<Vec<Sinks>> =

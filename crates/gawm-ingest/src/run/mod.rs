@@ -15,6 +15,7 @@ mod recording;
 mod report;
 mod session;
 mod sink;
+mod source;
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -146,7 +147,7 @@ impl Run<'_> {
             return Err(RunError::Interrupted);
         }
         let path = recording::path_of(recording);
-        let open = match OpenRecording::open(recording, self.options.contract) {
+        let mut open = match OpenRecording::open(recording, self.options.contract) {
             Ok(open) => open,
             Err(error) => return Ok(FileReport::refused(&path, with_hint(&error.to_string(), error.hint()))),
         };
@@ -157,6 +158,7 @@ impl Run<'_> {
                 return Ok(FileReport::refused(&path, with_hint(&refusal.to_string(), refusal.hint())));
             }
         };
+        open.select(&self.topics_of(&binding));
         let probed = probe::probe(&open, &binding, self.options.contract, &self.library)?;
         let schema = binding.schema(self.options.contract, probed.rate_hz, &probed.sizes)?;
         if let Some(stream) = probed.without_size.first() {
@@ -185,6 +187,17 @@ impl Run<'_> {
         };
         let outcome = recording::write(&context, &open, &path, writer)?;
         Ok(self.account(outcome, report))
+    }
+
+    /// Returns every topic that a contract asks for: of streams, labels and markers.
+    fn topics_of(&self, binding: &Binding) -> Vec<String> {
+        let streams = binding.streams.iter().map(|stream| stream.topic.clone());
+        let labels = self.labels.topics().into_iter().map(|(topic, _)| topic);
+        let marker = match &self.options.contract.episodes {
+            crate::contract::EpisodeRule::Marker { topic, .. } => Some(topic.clone()),
+            _ => None,
+        };
+        streams.chain(labels).chain(marker).collect()
     }
 
     fn account(&mut self, outcome: RecordingOutcome, report: &mut Report) -> FileReport {
