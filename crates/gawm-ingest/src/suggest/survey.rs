@@ -11,7 +11,7 @@ use super::SuggestError;
 use crate::decode::{Decoded, DecodePlan, FieldInfo, RowSink, SchemaLibrary, StampSource, sample_fields};
 use crate::inspect::{ChannelProbe, ChannelReport, MessageProbe, inspect_log};
 use crate::log::{Channel, Log, OpenOptions, decompress_message, discover, looks_like_zstd};
-use crate::run::{OpenRecording, schema_of};
+use crate::run::{OpenRecording, Source, schema_of};
 
 /// Payloads that are kept per topic.
 const SAMPLES: usize = 48;
@@ -118,9 +118,10 @@ pub(crate) fn survey(inputs: &[PathBuf], library: &SchemaLibrary, options: &Open
             }
         };
         recordings += 1;
-        let open = OpenRecording::of(recording.name.clone(), logs);
+        let sources = logs.into_iter().map(|log| Source::Log(Box::new(log))).collect();
+        let open = OpenRecording::of(recording.name.clone(), sources);
         let mut seen: BTreeMap<String, Topic> = BTreeMap::new();
-        for log in &open.logs {
+        for log in open.logs.iter().filter_map(Source::as_log) {
             for report in inspect_log(log, log.path(), &probe).channels {
                 add_report(&mut seen, report, &open);
             }
@@ -144,7 +145,7 @@ pub(crate) fn survey(inputs: &[PathBuf], library: &SchemaLibrary, options: &Open
     collect_samples(&first, &mut topics, library);
     let spans = topics.values().filter(|topic| topic.span_ns.0 > 0).map(|topic| topic.span_ns);
     let span_ns = spans.fold((i64::MAX, i64::MIN), |all, span| (all.0.min(span.0), all.1.max(span.1)));
-    let metadata = first.logs.iter().flat_map(Log::metadata);
+    let metadata = first.logs.iter().flat_map(Source::metadata);
     let metadata = metadata.map(|record| (record.name.clone(), record.values.clone())).collect();
     let urdf = super::urdf::texts(&first, &topics, library);
     Ok(Survey {
@@ -239,7 +240,7 @@ impl Steps {
     /// Looks at the times of a recording in the order of the file; returns period and slow interval of each topic.
     fn look(&mut self, open: &OpenRecording) -> BTreeMap<String, (f64, f64)> {
         let mut times: BTreeMap<String, Vec<Times>> = BTreeMap::new();
-        for log in &open.logs {
+        for log in open.logs.iter().filter_map(Source::as_log) {
             for block in log.blocks_in_file_order() {
                 let block = log.read_block(&block);
                 for message in &block.messages {
