@@ -84,10 +84,24 @@ fn crates_link_nothing_beyond_their_border() {
         if !crates.contains_key(*package) {
             continue;
         }
-        let tree = cargo(&["tree", "--offline", "-p", package, "-e", "normal", "--prefix", "none", "--format", "{p}"]);
+        let tree = cargo(&[
+            "tree",
+            "--offline",
+            "-p",
+            package,
+            "-e",
+            "normal",
+            "--prefix",
+            "none",
+            "--format",
+            "{p}",
+        ]);
         let linked: BTreeSet<&str> = tree.lines().filter_map(|line| line.split(' ').next()).collect();
         for name in *forbidden {
-            assert!(!linked.contains(name), "{package} links {name}; `cargo tree -p {package} -i {name}` shows how");
+            assert!(
+                !linked.contains(name),
+                "{package} links {name}; `cargo tree -p {package} -i {name}` shows how"
+            );
         }
     }
 }
@@ -107,7 +121,11 @@ fn unsafe_lives_where_it_may() {
     for package in our_crates().keys().filter(|name| name.starts_with("gawm-") && *name != "gawm-e2e") {
         let lib = std::fs::read_to_string(root().join(format!("crates/{package}/src/lib.rs"))).unwrap();
         let forbids = lib.contains("#![forbid(unsafe_code)]");
-        assert_eq!(forbids, !UNSAFE_CRATES.contains(&package.as_str()), "{package}/src/lib.rs and forbid(unsafe_code)");
+        assert_eq!(
+            forbids,
+            !UNSAFE_CRATES.contains(&package.as_str()),
+            "{package}/src/lib.rs and forbid(unsafe_code)"
+        );
     }
 }
 
@@ -115,7 +133,10 @@ fn unsafe_lives_where_it_may() {
 fn source_files_stay_readable() {
     let exempt = |path: &Path| {
         let name = path.to_string_lossy();
-        name.contains("/tests") || name.contains("/fuzz/") || name.contains("/benches/") || name.ends_with("tables.rs")
+        name.contains("/tests")
+            || name.contains("/fuzz/")
+            || name.contains("/benches/")
+            || name.ends_with("tables.rs")
     };
     let too_long: Vec<_> = sources()
         .filter(|(path, _)| !exempt(path))
@@ -128,7 +149,12 @@ fn source_files_stay_readable() {
 #[test]
 fn nothing_is_left_undone_or_ignored() {
     // Split so that this file does not find itself.
-    let banned = [concat!("todo", "!("), concat!("unimpl", "emented!("), concat!("#[ign", "ore"), concat!("FIX", "ME")];
+    let banned = [
+        concat!("todo", "!("),
+        concat!("unimpl", "emented!("),
+        concat!("#[ign", "ore"),
+        concat!("FIX", "ME"),
+    ];
     for (path, text) in sources() {
         for word in banned {
             assert!(!text.contains(word), "{} holds {word}", path.display());
@@ -149,7 +175,8 @@ fn no_path_of_a_machine_is_committed() {
         for (line, content) in text.lines().enumerate() {
             let found = machine_paths.iter().find(|machine| {
                 content.match_indices(machine.as_str()).any(|(at, _)| {
-                    !content[..at].ends_with(|before: char| before.is_alphanumeric() || "_.-)}~".contains(before))
+                    !content[..at]
+                        .ends_with(|before: char| before.is_alphanumeric() || "_.-)}~".contains(before))
                 })
             });
             assert!(found.is_none(), "{}:{} names a path of a machine: {content}", path.display(), line + 1);

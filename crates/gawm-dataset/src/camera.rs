@@ -130,7 +130,8 @@ pub(crate) fn count_frames(
 
 /// Counts every n-th pixel of every n-th row, so that at most about 256 x 256 pixels are looked at.
 fn count_pixels(image: &Image) -> CameraStats {
-    let (height, width, channels) = (image.height() as usize, image.width() as usize, image.pixels().channels());
+    let (height, width, channels) =
+        (image.height() as usize, image.width() as usize, image.pixels().channels());
     let step = (height.max(width) / 256).max(1);
     let mut dense = vec![vec![0u64; 1 << 16]; channels.min(3)];
     for y in (0..height).step_by(step) {

@@ -31,10 +31,18 @@ pub(crate) struct ExplainArgs {
 
 /// Runs the command.
 pub(crate) fn run(args: &ExplainArgs, _global: &Global) -> Result<Exit, Failure> {
-    let question =
-        Question { dir: &args.dir, episode: args.episode, frame: args.frame, dim: &args.dim, logs: &args.log };
-    let text = explain(&question)
-        .map_err(|error| Failure { code: error.exit_code(), error: anyhow::Error::new(error), hint: None })?;
+    let question = Question {
+        dir: &args.dir,
+        episode: args.episode,
+        frame: args.frame,
+        dim: &args.dim,
+        logs: &args.log,
+    };
+    let text = explain(&question).map_err(|error| Failure {
+        code: error.exit_code(),
+        error: anyhow::Error::new(error),
+        hint: None,
+    })?;
     print(&text);
     Ok(Exit::Clean)
 }

@@ -34,7 +34,12 @@ pub(crate) struct RowOrigin {
 
 impl RowOrigin {
     pub(crate) fn files(&self) -> Vec<String> {
-        self.recording.source.files.iter().map(|file| format!("{} ({})", file.name, file.content_hash)).collect()
+        self.recording
+            .source
+            .files
+            .iter()
+            .map(|file| format!("{} ({})", file.name, file.content_hash))
+            .collect()
     }
 }
 
@@ -58,7 +63,10 @@ pub(crate) fn origin(
     let recording = meta
         .recordings
         .iter()
-        .find(|recording| (recording.first_episode..recording.first_episode + recording.episodes).contains(&question.episode))
+        .find(|recording| {
+            (recording.first_episode..recording.first_episode + recording.episodes)
+                .contains(&question.episode)
+        })
         .ok_or(ExplainError::Episode { episode: question.episode, episodes })?;
     let mut length = 0;
     let mut found: Option<RowOrigin> = None;
@@ -66,8 +74,11 @@ pub(crate) fn origin(
         let path = dir.join(data_path(file.number));
         let mut row = 0;
         read(&path, feature, &mut |batch| {
-            let column = |name: &str| batch.column_by_name(name).and_then(|column| column.as_primitive_opt::<Int64Type>().cloned());
-            let (Some(episode), Some(frame), Some(time)) = (column("episode_index"), column("frame_index"), column(TIME_NS))
+            let column = |name: &str| {
+                batch.column_by_name(name).and_then(|column| column.as_primitive_opt::<Int64Type>().cloned())
+            };
+            let (Some(episode), Some(frame), Some(time)) =
+                (column("episode_index"), column("frame_index"), column(TIME_NS))
             else {
                 return;
             };
@@ -119,7 +130,12 @@ fn read(path: &Path, feature: &Feature, take: &mut dyn FnMut(&RecordBatch)) -> R
     Ok(())
 }
 
-fn value_of(batch: &RecordBatch, feature: &Feature, index: Option<usize>, row: usize) -> (Option<f64>, Option<usize>) {
+fn value_of(
+    batch: &RecordBatch,
+    feature: &Feature,
+    index: Option<usize>,
+    row: usize,
+) -> (Option<f64>, Option<usize>) {
     let Some(column) = batch.column_by_name(&feature.name) else { return (None, None) };
     match index {
         None => {

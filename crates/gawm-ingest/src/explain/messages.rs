@@ -35,10 +35,14 @@ pub(crate) struct Found {
 }
 
 /// Opens the files of a recording, found by their hashes among files and folders.
-pub(crate) fn sources(recording: &RecordingRecord, inputs: &[PathBuf]) -> Result<Option<OpenRecording>, ExplainError> {
+pub(crate) fn sources(
+    recording: &RecordingRecord,
+    inputs: &[PathBuf],
+) -> Result<Option<OpenRecording>, ExplainError> {
     let mut logs = Vec::new();
     let found = discover(inputs);
-    let candidates: Vec<PathBuf> = found.recordings.into_iter().flat_map(|recording| recording.parts).collect();
+    let candidates: Vec<PathBuf> =
+        found.recordings.into_iter().flat_map(|recording| recording.parts).collect();
     for file in &recording.source.files {
         for path in &candidates {
             let is_length = std::fs::metadata(path).is_ok_and(|meta| meta.len() == file.length_bytes);
@@ -114,7 +118,8 @@ pub(crate) fn around(
                 });
             };
             for (group, (range, stamp_ns)) in topic.groups.iter().zip(&message.rows) {
-                for (_, columns) in group.streams.iter().filter(|(at, _)| *at == stream && !range.is_empty()) {
+                for (_, columns) in group.streams.iter().filter(|(at, _)| *at == stream && !range.is_empty())
+                {
                     take(*stamp_ns, decoded.values[range.clone()][columns.clone()].to_vec());
                 }
             }
@@ -142,7 +147,8 @@ fn mark(found: &mut [Found], rule: &crate::contract::CheckedStream, origin: &Row
     let sample_ns = age_ns.map(|age| origin.time_ns - age);
     let next_ns = origin.next_ns.unwrap_or(origin.time_ns);
     let is_window = matches!(timing, Some(ActionTiming::Resample(_) | ActionTiming::Reduce(_)));
-    let has_window = found.iter().any(|message| message.time_ns > origin.time_ns && message.time_ns <= next_ns);
+    let has_window =
+        found.iter().any(|message| message.time_ns > origin.time_ns && message.time_ns <= next_ns);
     let mut was_used = false;
     for message in found.iter_mut() {
         message.is_after = message.time_ns > origin.time_ns;
@@ -162,7 +168,12 @@ fn neighbours(found: Vec<Found>) -> Vec<Found> {
         return found.into_iter().take(LISTED).collect();
     };
     let last = found.iter().rposition(|message| message.is_used).unwrap_or(first);
-    found.into_iter().enumerate().filter(|(at, _)| at + 1 >= first && *at <= last + 1).map(|(_, message)| message).collect()
+    found
+        .into_iter()
+        .enumerate()
+        .filter(|(at, _)| at + 1 >= first && *at <= last + 1)
+        .map(|(_, message)| message)
+        .collect()
 }
 
 /// Writes the messages.
@@ -186,7 +197,11 @@ pub(crate) fn describe(
         let value = value.map_or("image".to_owned(), |value| format!("{value:?}"));
         let stamp = message.stamp_ns.map_or("none".to_owned(), |ns| ns.to_string());
         let when = if message.is_after { "after the tick" } else { "at or before the tick" };
-        writeln!(text, "  {mark} {value}  {} in {} at offset {}, sequence {}", message.topic, message.file, message.offset, message.sequence)?;
+        writeln!(
+            text,
+            "  {mark} {value}  {} in {} at offset {}, sequence {}",
+            message.topic, message.file, message.offset, message.sequence
+        )?;
         writeln!(
             text,
             "      time {} ({when})  stamp {stamp}  publish {}  log {}",

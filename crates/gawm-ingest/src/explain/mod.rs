@@ -104,7 +104,11 @@ impl Target<'_> {
         match (&self.feature.data, self.index) {
             (FeatureData::Vector { parts, .. }, Some(index)) => {
                 let dim = parts.iter().flat_map(|part| &part.dims).nth(index);
-                format!("{}[{index}] {:?}", self.feature.name, dim.map(|dim| dim.name.as_str()).unwrap_or_default())
+                format!(
+                    "{}[{index}] {:?}",
+                    self.feature.name,
+                    dim.map(|dim| dim.name.as_str()).unwrap_or_default()
+                )
             }
             _ => self.feature.name.clone(),
         }
@@ -138,10 +142,13 @@ pub fn explain(question: &Question<'_>) -> Result<String, ExplainError> {
         // Types that are missing now only keep their channels from being shown.
         library.add_folder(folder).ok();
     }
-    let binding = Binding::new(&contract, &open.name, &open.channels, &library).map_err(|error| match error {
-        BindError::Run(error) => ExplainError::Run(error),
-        BindError::Refused(refusal) => ExplainError::Log { path: question.dir.to_owned(), detail: refusal.to_string() },
-    })?;
+    let binding =
+        Binding::new(&contract, &open.name, &open.channels, &library).map_err(|error| match error {
+            BindError::Run(error) => ExplainError::Run(error),
+            BindError::Refused(refusal) => {
+                ExplainError::Log { path: question.dir.to_owned(), detail: refusal.to_string() }
+            }
+        })?;
     match stream_of(&binding, &target) {
         Some((stream, columns)) => {
             rule(&mut text, &binding.streams[stream].rule, &binding.streams[stream].topic).ok();
@@ -149,7 +156,9 @@ pub fn explain(question: &Question<'_>) -> Result<String, ExplainError> {
             let used = messages::around(&open, &binding, stream, &contract, &origin, &library);
             messages::describe(&mut text, &binding.streams[stream], columns, &used).ok();
         }
-        None => text.push_str("  rule: derived from the state of this row and the next; there is no message behind it\n"),
+        None => text.push_str(
+            "  rule: derived from the state of this row and the next; there is no message behind it\n",
+        ),
     }
     encoding(&mut text, &meta, &target);
     Ok(text)
@@ -199,13 +208,24 @@ fn stream_of(binding: &Binding, target: &Target<'_>) -> Option<(usize, Option<us
     None
 }
 
-fn row(text: &mut String, question: &Question<'_>, target: &Target<'_>, origin: &RowOrigin) -> std::fmt::Result {
+fn row(
+    text: &mut String,
+    question: &Question<'_>,
+    target: &Target<'_>,
+    origin: &RowOrigin,
+) -> std::fmt::Result {
     let value = match origin.value {
         Some(value) => format!("{value:?}{}", unit_of(target)),
         None => format!("an image of {} bytes", origin.image_bytes.unwrap_or_default()),
     };
     let valid = if origin.is_valid { "valid" } else { "not valid" };
-    writeln!(text, "{} in episode {}, frame {}: {value}, {valid}", target.name(), question.episode, question.frame)?;
+    writeln!(
+        text,
+        "{} in episode {}, frame {}: {value}, {valid}",
+        target.name(),
+        question.episode,
+        question.frame
+    )?;
     writeln!(text, "  row: {} of {}, tick {} ns", origin.row, origin.file, origin.time_ns)
 }
 
@@ -230,8 +250,9 @@ fn rule(text: &mut String, stream: &CheckedStream, topic: &str) -> std::fmt::Res
         Clock::Log => "log time".to_owned(),
         Clock::Field(path) => format!("field {path}"),
     };
-    let tolerance =
-        stream.tolerance_ns.map_or("no tolerance".to_owned(), |ns| format!("tolerance {} ms", ns as f64 / 1e6));
+    let tolerance = stream
+        .tolerance_ns
+        .map_or("no tolerance".to_owned(), |ns| format!("tolerance {} ms", ns as f64 / 1e6));
     writeln!(
         text,
         "  stream: {:?}, topic {topic}, clock: {clock}, offset {} ms",
@@ -250,7 +271,11 @@ fn rule(text: &mut String, stream: &CheckedStream, topic: &str) -> std::fmt::Res
     if let StreamData::Vector(rule) = &stream.data
         && !rule.unit.is_identity()
     {
-        writeln!(text, "  conversion: recorded * {} + {} = {}", rule.unit.factor, rule.unit.offset, rule.unit.si.0)?;
+        writeln!(
+            text,
+            "  conversion: recorded * {} + {} = {}",
+            rule.unit.factor, rule.unit.offset, rule.unit.si.0
+        )?;
     }
     Ok(())
 }
@@ -270,8 +295,11 @@ fn ages(text: &mut String, origin: &RowOrigin, stream: usize) -> std::fmt::Resul
 
 fn encoding(text: &mut String, meta: &gawm_dataset::GawmMeta, target: &Target<'_>) {
     let FeatureData::Vector { parts, .. } = &target.feature.data else { return };
-    let Some(dim) = parts.iter().flat_map(|part| &part.dims).nth(target.index.unwrap_or_default()) else { return };
-    let kind = parts.iter().find(|part| part.dims.iter().any(|other| other.name == dim.name)).map(|part| part.kind);
+    let Some(dim) = parts.iter().flat_map(|part| &part.dims).nth(target.index.unwrap_or_default()) else {
+        return;
+    };
+    let kind =
+        parts.iter().find(|part| part.dims.iter().any(|other| other.name == dim.name)).map(|part| part.kind);
     writeln!(text, "  kind: {}", kind.map(shown_kind).unwrap_or_default()).ok();
     for (column, dims) in &meta.encodings {
         for (position, encoded) in dims.iter().enumerate() {
@@ -281,8 +309,12 @@ fn encoding(text: &mut String, meta: &gawm_dataset::GawmMeta, target: &Target<'_
             let standard = meta.standardisation.iter().find(|fit| fit.column == *column);
             let fit = standard.and_then(|fit| fit.dims.get(position));
             let standardised = match fit {
-                Some(fit) if fit.is_standardised && fit.is_constant => "constant in the training data: scale 1".to_owned(),
-                Some(fit) if fit.is_standardised => format!("standardised as (x - {:?}) / {:?}", fit.mean, fit.scale),
+                Some(fit) if fit.is_standardised && fit.is_constant => {
+                    "constant in the training data: scale 1".to_owned()
+                }
+                Some(fit) if fit.is_standardised => {
+                    format!("standardised as (x - {:?}) / {:?}", fit.mean, fit.scale)
+                }
                 _ => "not standardised".to_owned(),
             };
             writeln!(

@@ -70,7 +70,8 @@ pub(crate) fn decode_block(read: Block, plans: &Plans) -> DecodedBlock {
         match plan.topic {
             None => unmapped[channel] += 1,
             Some(topic) => {
-                let decoded = decode_message(&read, message, plan, topic, plans, &mut sinks[channel], &mut out.values);
+                let decoded =
+                    decode_message(&read, message, plan, topic, plans, &mut sinks[channel], &mut out.values);
                 out.messages.push(decoded);
             }
         }

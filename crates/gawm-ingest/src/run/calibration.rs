@@ -26,7 +26,10 @@ pub(crate) fn keep(
         let Some(topic) = &rule.spec.camera_info else { continue };
         match infos.get(topic) {
             Some(info) => {
-                writer.add_calibration(&stream.feature, &calibration(&stream.feature, topic, info, &rule.spec))?;
+                writer.add_calibration(
+                    &stream.feature,
+                    &calibration(&stream.feature, topic, info, &rule.spec),
+                )?;
             }
             None => warnings.push(format!("{}: no calibration on {topic:?}", stream.feature)),
         }
@@ -46,7 +49,11 @@ pub(crate) fn keep(
             }
             match log.read_attachment(index) {
                 Ok(bytes) => {
-                    let name = if attachment.name.chars().any(char::is_alphanumeric) { &attachment.name } else { "attachment" };
+                    let name = if attachment.name.chars().any(char::is_alphanumeric) {
+                        &attachment.name
+                    } else {
+                        "attachment"
+                    };
                     writer.add_attachment(name, &bytes)?;
                 }
                 Err(error) => warnings.push(format!("attachment {:?} is not kept: {error}", attachment.name)),

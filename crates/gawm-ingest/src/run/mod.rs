@@ -24,14 +24,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use gawm_dataset::{DatasetSpec, DatasetSummary, DatasetWriter, WriteError, WriteMode};
 use gawm_schema::Schema;
 
-pub(crate) use block::decode_block;
 pub use bind::{BindError, Binding, BoundFeature, BoundStream, FeatureSource};
+pub(crate) use block::decode_block;
 pub use error::{Refusal, RunError};
 pub(crate) use picture::Picture;
 pub(crate) use plan::{Plans, schema_of};
 pub(crate) use recording::OpenRecording;
-pub(crate) use source::Source;
 pub use report::{FileReport, FileStatus, LostReport, Report, StreamReport, TopicReport};
+pub(crate) use source::Source;
 
 use crate::contract::{CheckedContract, to_toml};
 use crate::decode::SchemaLibrary;
@@ -98,7 +98,15 @@ pub fn run(options: &RunOptions<'_>, report: &mut Report) -> Result<RunOutcome, 
         report.files.push(FileReport::refused(error.path(), with_hint(&error.to_string(), error.hint())));
     }
     report.warnings.extend(options.contract.warnings.iter().cloned());
-    let mut run = Run { options, library, labels, pool, writer: None, ages: Vec::new(), is_new_folder: is_empty(options.out) };
+    let mut run = Run {
+        options,
+        library,
+        labels,
+        pool,
+        writer: None,
+        ages: Vec::new(),
+        is_new_folder: is_empty(options.out),
+    };
     for (index, recording) in recordings.iter().enumerate() {
         if let Some((shard, n)) = options.shard
             && index as u64 % n != shard
@@ -176,7 +184,8 @@ impl Run<'_> {
         self.prepare_writer(&schema, report)?;
         let Some(writer) = self.writer.as_mut() else { return Ok(FileReport::refused(&path, String::new())) };
         if let Some((place, expected, got)) = writer.schema().difference(&schema) {
-            let detail = format!("{place} differs from the recordings before: expected {expected}, got {got}");
+            let detail =
+                format!("{place} differs from the recordings before: expected {expected}, got {got}");
             let refusal = Refusal::OtherSchema { detail };
             return Ok(FileReport::refused(&path, with_hint(&refusal.to_string(), refusal.hint())));
         }

@@ -3,8 +3,8 @@
 use bytes::Bytes;
 use gawm_image::{
     CropRect, FileFormat, Image, ImageError, Layout, Limits, Pixels, RawImage, crop, decode,
-    decode_compressed_depth, decode_raw, encode_jpeg, encode_png, encode_tiff, is_compressed_depth, resize, to_rgb8,
-    verify,
+    decode_compressed_depth, decode_raw, encode_jpeg, encode_png, encode_tiff, is_compressed_depth, resize,
+    to_rgb8, verify,
 };
 use gawm_schema::ImageSpec;
 
@@ -129,7 +129,9 @@ impl Picture {
         }
         let bytes = match (rule.format, image.pixels()) {
             (_, Pixels::GrayF32(_)) => encode_tiff(&image)?,
-            (ImageFormat::Jpeg, Pixels::Rgb8(_)) => encode_jpeg(&image, rule.quality.unwrap_or(DEFAULT_QUALITY))?,
+            (ImageFormat::Jpeg, Pixels::Rgb8(_)) => {
+                encode_jpeg(&image, rule.quality.unwrap_or(DEFAULT_QUALITY))?
+            }
             _ => encode_png(&image)?,
         };
         Ok(Bytes::from(bytes))

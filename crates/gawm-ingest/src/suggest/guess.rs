@@ -56,7 +56,10 @@ pub(crate) fn guess(survey: &Survey, library: &SchemaLibrary) -> Suggestion {
     if found.iter().any(|(topic, guess)| is_rich(topic) && !matches!(guess, Guess::Skip(_))) {
         for (topic, guess) in &mut found {
             if !is_rich(topic) && !matches!(guess, Guess::Skip(_)) {
-                let text = format!("{} messages in {} of {} logs", topic.messages, topic.recordings, survey.recordings);
+                let text = format!(
+                    "{} messages in {} of {} logs",
+                    topic.messages, topic.recordings, survey.recordings
+                );
                 *guess = Guess::Skip(text);
             }
         }
@@ -109,7 +112,11 @@ fn guess_topic(topic: &Topic, survey: &Survey, library: &SchemaLibrary) -> Guess
         return Guess::Skip(format!("no message could be decoded: {}", failure.unwrap_or_default()));
     }
     let groups = joints(topic, &messages, survey).unwrap_or_else(|| numbers(topic, &messages));
-    if groups.is_empty() { Guess::Skip("holds no numbers of fixed number".to_owned()) } else { Guess::Vectors(groups) }
+    if groups.is_empty() {
+        Guess::Skip("holds no numbers of fixed number".to_owned())
+    } else {
+        Guess::Vectors(groups)
+    }
 }
 
 /// Returns whether a topic holds images; an error when it does, of a kind that cannot be used.
@@ -151,8 +158,11 @@ enum JointLayout<'a> {
 
 fn joint_layout(topic: &Topic) -> Option<JointLayout<'_>> {
     let has = |path: &str| topic.fields.iter().any(|field| field.path == path);
-    let parallel = [("name", "position"), ("joint_names", "positions"), ("names", "positions"), ("name", "positions")];
-    if let Some((key, value)) = parallel.into_iter().find(|(key, value)| has(&format!("{key}[]")) && has(&format!("{value}[]"))) {
+    let parallel =
+        [("name", "position"), ("joint_names", "positions"), ("names", "positions"), ("name", "positions")];
+    if let Some((key, value)) =
+        parallel.into_iter().find(|(key, value)| has(&format!("{key}[]")) && has(&format!("{value}[]")))
+    {
         return Some(JointLayout::Parallel { key, value });
     }
     topic.fields.iter().find_map(|field| {
@@ -166,16 +176,20 @@ fn joint_layout(topic: &Topic) -> Option<JointLayout<'_>> {
 fn joints(topic: &Topic, messages: &[Value], survey: &Survey) -> Option<Vec<Group>> {
     let layout = joint_layout(topic)?;
     let names_of = |message: &Value| -> Option<Vec<String>> {
-        let texts = |items: &[Value]| items.iter().filter_map(|name| name.as_str().map(str::to_owned)).collect();
+        let texts =
+            |items: &[Value]| items.iter().filter_map(|name| name.as_str().map(str::to_owned)).collect();
         let names: Vec<String> = match layout {
             JointLayout::Parallel { key, value } => {
                 let names = message.get(key)?.as_array()?;
                 let values = message.get(value)?.as_array()?;
                 if names.len() == values.len() { texts(names) } else { return None }
             }
-            JointLayout::Structs { list } => {
-                message.get(list)?.as_array()?.iter().filter_map(|item| Some(item.get("name")?.as_str()?.to_owned())).collect()
-            }
+            JointLayout::Structs { list } => message
+                .get(list)?
+                .as_array()?
+                .iter()
+                .filter_map(|item| Some(item.get("name")?.as_str()?.to_owned()))
+                .collect(),
         };
         (!names.is_empty()).then_some(names)
     };
@@ -201,11 +215,17 @@ fn joints(topic: &Topic, messages: &[Value], survey: &Survey) -> Option<Vec<Grou
     for name in common {
         let joint = known.get(&name);
         let (kind, unit, reason) = match joint.map(|joint| joint.kind.as_str()) {
-            Some("prismatic") if names::is_gripper(&name) => (KindSpec::Gripper, "m", "prismatic in the URDF, and named as a gripper"),
+            Some("prismatic") if names::is_gripper(&name) => {
+                (KindSpec::Gripper, "m", "prismatic in the URDF, and named as a gripper")
+            }
             Some("prismatic") => (KindSpec::Linear, "m", "prismatic in the URDF"),
             Some(_) => (KindSpec::Angle, "rad", "revolute or continuous in the URDF"),
-            None if names::is_gripper(&name) => (KindSpec::Gripper, "m", "named as a gripper; no URDF says its unit"),
-            None => (KindSpec::Angle, "rad", "positions of joints are angles in rad unless a URDF says otherwise"),
+            None if names::is_gripper(&name) => {
+                (KindSpec::Gripper, "m", "named as a gripper; no URDF says its unit")
+            }
+            None => {
+                (KindSpec::Angle, "rad", "positions of joints are angles in rad unless a URDF says otherwise")
+            }
         };
         let limits = joint.and_then(|joint| joint.limits);
         let quoted = name.replace('\\', "\\\\").replace('"', "\\\"");
@@ -268,9 +288,19 @@ fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
             break;
         }
         let (kind, unit, reason) = kind_of(topic, field);
-        match groups.last_mut().filter(|group| group.kind == kind && group.unit == unit && group.reason == reason) {
+        match groups
+            .last_mut()
+            .filter(|group| group.kind == kind && group.unit == unit && group.reason == reason)
+        {
             Some(group) => group.fields.push(path),
-            None => groups.push(Group { fields: vec![path], kind, unit, limits: Vec::new(), reason, is_joints: false }),
+            None => groups.push(Group {
+                fields: vec![path],
+                kind,
+                unit,
+                limits: Vec::new(),
+                reason,
+                is_joints: false,
+            }),
         }
     }
     // A single text that holds JSON: its numbers, when all samples have them.
@@ -322,9 +352,13 @@ fn fixed_path(field: &FieldInfo, messages: &[Value]) -> Option<(String, usize)> 
                     items.iter().all(|item| is_number(Some(item))).then_some(items.len())
                 })
                 .collect();
-            let n = lengths.iter().flatten().max_by_key(|n| lengths.iter().filter(|other| **other == Some(**n)).count())?;
+            let n = lengths
+                .iter()
+                .flatten()
+                .max_by_key(|n| lengths.iter().filter(|other| **other == Some(**n)).count())?;
             let same = lengths.iter().filter(|length| **length == Some(*n)).count();
-            (*n > 0 && *n <= MAX_WIDTH && is_most(same, lengths.len())).then(|| (format!("{base}[0:{n}]"), *n))
+            (*n > 0 && *n <= MAX_WIDTH && is_most(same, lengths.len()))
+                .then(|| (format!("{base}[0:{n}]"), *n))
         }
         _ => None,
     }
@@ -352,7 +386,13 @@ fn kind_of(topic: &Topic, field: &FieldInfo) -> (KindSpec, Option<String>, Strin
         return (KindSpec::Bool, None, "truth values".to_owned());
     }
     if names::is_gripper(&field.path) || names::is_gripper(&topic.channel.topic) {
-        let unit = if field.path.ends_with("_m") { some("m") } else if field.path.ends_with("_n") { some("N") } else { None };
+        let unit = if field.path.ends_with("_m") {
+            some("m")
+        } else if field.path.ends_with("_n") {
+            some("N")
+        } else {
+            None
+        };
         if unit.as_deref() != Some("N") {
             return (KindSpec::Gripper, unit, "named as a gripper".to_owned());
         }
@@ -361,7 +401,9 @@ fn kind_of(topic: &Topic, field: &FieldInfo) -> (KindSpec, Option<String>, Strin
     let bare = topic.type_name().rsplit(['/', '.']).next().unwrap_or("");
     let is_pose = field.owner.ends_with("Point") || has("position") || has("translation");
     let unit = match () {
-        () if has("angular") && (has("velocity") || bare.starts_with("Twist") || has("twist")) => some("rad/s"),
+        () if has("angular") && (has("velocity") || bare.starts_with("Twist") || has("twist")) => {
+            some("rad/s")
+        }
         () if has("acceleration") => some("m/s^2"),
         () if has("linear") && (has("velocity") || bare.starts_with("Twist") || has("twist")) => some("m/s"),
         () if is_pose && field.path.ends_with(['x', 'y', 'z']) => some("m"),
@@ -377,12 +419,14 @@ fn kind_of(topic: &Topic, field: &FieldInfo) -> (KindSpec, Option<String>, Strin
         () if field.path.ends_with("_m") => some("m"),
         () => None,
     };
-    let reason = if unit.is_some() { "unit by type and name" } else { "unit unknown: say `unit` if you know it" };
+    let reason =
+        if unit.is_some() { "unit by type and name" } else { "unit unknown: say `unit` if you know it" };
     (KindSpec::Linear, unit, reason.to_owned())
 }
 
 fn json_in_text(topic: &Topic, messages: &[Value]) -> Option<Group> {
-    let text_field = topic.fields.iter().find(|field| field.scalar == Some(Scalar::Text) && field.arrays.is_empty())?;
+    let text_field =
+        topic.fields.iter().find(|field| field.scalar == Some(Scalar::Text) && field.arrays.is_empty())?;
     let parse = |message: &Value| -> Option<Value> {
         let text = crate::episodes::value_at(message, &text_field.path)?;
         serde_json::from_str(text.as_str()?).ok()
@@ -393,7 +437,8 @@ fn json_in_text(topic: &Topic, messages: &[Value]) -> Option<Group> {
     let mut fields = Vec::new();
     for (name, value) in first {
         let is_plain = name.chars().all(|c| c.is_alphanumeric() || c == '_');
-        let is_always = inner.iter().all(|other| other.get(name).is_some_and(|v| v.is_number() || v.is_boolean()));
+        let is_always =
+            inner.iter().all(|other| other.get(name).is_some_and(|v| v.is_number() || v.is_boolean()));
         if is_plain && is_always && value.is_number() && !names::is_bookkeeping(name) {
             fields.push(format!("{}.{name}", text_field.path));
         }
@@ -427,7 +472,9 @@ pub(crate) fn clock_of(topic: &Topic) -> (String, String) {
                 );
                 return publish_or_log(topic, reason);
             }
-            None if report.messages == 1 => return ("stamp".to_owned(), "one message, with a header stamp".to_owned()),
+            None if report.messages == 1 => {
+                return ("stamp".to_owned(), "one message, with a header stamp".to_owned());
+            }
             None => {}
         }
     }
@@ -441,7 +488,10 @@ fn publish_or_log(topic: &Topic, otherwise: String) -> (String, String) {
                 && offset.median_ms.abs() <= MAX_STAMP_OFFSET_MS
                 && offset.p95_ms - offset.p05_ms <= MAX_STAMP_OFFSET_MS =>
         {
-            let reason = format!("publish time, {:.1} ms before the log time; no usable header stamp", offset.median_ms);
+            let reason = format!(
+                "publish time, {:.1} ms before the log time; no usable header stamp",
+                offset.median_ms
+            );
             ("publish".to_owned(), reason)
         }
         _ => ("log".to_owned(), otherwise),
@@ -487,8 +537,11 @@ fn base_stream(topic: &Topic, feature: &str, role: RoleSpec) -> (StreamSpec, Vec
         action: None,
         image: None,
     };
-    let reasons =
-        vec![format!("{}, {} messages", shown_type(topic), topic.messages), format!("clock: {clock_reason}"), format!("tolerance: {rate_reason}")];
+    let reasons = vec![
+        format!("{}, {} messages", shown_type(topic), topic.messages),
+        format!("clock: {clock_reason}"),
+        format!("tolerance: {rate_reason}"),
+    ];
     (stream, reasons)
 }
 
@@ -507,7 +560,11 @@ fn add_groups(
         stream.unit.clone_from(&group.unit);
         stream.limits.clone_from(&group.limits);
         stream.order = (group.kind == KindSpec::Quaternion).then(|| {
-            if group.fields.first().is_some_and(|field| field.ends_with(".w")) { QuaternionOrder::Wxyz } else { QuaternionOrder::Xyzw }
+            if group.fields.first().is_some_and(|field| field.ends_with(".w")) {
+                QuaternionOrder::Wxyz
+            } else {
+                QuaternionOrder::Xyzw
+            }
         });
         if role == RoleSpec::Action {
             stream.action = Some(action_rule(ActionTimingSpec::InForce));
@@ -525,7 +582,9 @@ pub(crate) fn action_rule(timing: ActionTimingSpec) -> ActionSpec {
 
 /// Returns whether a topic, or some of its fields, are commands.
 fn command_split(topic: &Topic, groups: &[Group]) -> (Vec<Group>, Vec<Group>) {
-    if names::is_command(&topic.channel.topic) || names::is_command(topic.type_name().rsplit(['/', '.']).next().unwrap_or("")) {
+    if names::is_command(&topic.channel.topic)
+        || names::is_command(topic.type_name().rsplit(['/', '.']).next().unwrap_or(""))
+    {
         return (Vec::new(), groups.to_vec());
     }
     let (mut states, mut commands) = (Vec::new(), Vec::new());
@@ -561,9 +620,13 @@ fn add_states(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Gu
     let mut has_state = false;
     for (topic, groups) in &measured {
         let (state, why) = match () {
-            () if is_marker(groups, topic) => (None, "a flag that is switched at times: an annotation of each row"),
+            () if is_marker(groups, topic) => {
+                (None, "a flag that is switched at times: an annotation of each row")
+            }
             () if is_joints(groups) => (Some(()), "joint states are the state"),
-            () if has_joints && is_gripper(topic, groups) => (Some(()), "a gripper belongs to the state of the arm"),
+            () if has_joints && is_gripper(topic, groups) => {
+                (Some(()), "a gripper belongs to the state of the arm")
+            }
             () if has_joints => (None, "beside the joint states: carried along, not a target"),
             () => (Some(()), "no joint states in this log: every number that is measured is state"),
         };
@@ -576,7 +639,9 @@ fn add_states(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Gu
             }
             _ if !covers => suggestion.unmapped.push(format!(
                 "{} ({}): {} messages that cover less than half of the log",
-                topic.channel.topic, shown_type(topic), topic.messages
+                topic.channel.topic,
+                shown_type(topic),
+                topic.messages
             )),
             _ if is_marker(groups, topic) => {
                 if !names::is_recording(&topic.channel.topic) {
@@ -584,11 +649,25 @@ fn add_states(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Gu
                     add_groups(suggestion, topic, groups, &feature, RoleSpec::Annotation, why);
                 }
             }
-            _ => add_groups(suggestion, topic, groups, &format!("observation.{feature}"), RoleSpec::Observation, why),
+            _ => add_groups(
+                suggestion,
+                topic,
+                groups,
+                &format!("observation.{feature}"),
+                RoleSpec::Observation,
+                why,
+            ),
         }
     }
     if !has_state && let Some((topic, groups)) = measured.iter().max_by_key(|(topic, _)| topic.messages) {
-        add_groups(suggestion, topic, groups, "observation.state", RoleSpec::State, "the topic with most messages");
+        add_groups(
+            suggestion,
+            topic,
+            groups,
+            "observation.state",
+            RoleSpec::State,
+            "the topic with most messages",
+        );
     }
 }
 
@@ -609,7 +688,8 @@ fn add_actions(suggestion: &mut Suggestion, found: &[(&Topic, Guess)]) {
                 if is_angular && group.fields.len() == 3 {
                     group.kind = KindSpec::Rotvec;
                     group.unit = Some("rad".to_owned());
-                    "a step of rotation, by the topic's name: a rotation vector".clone_into(&mut group.reason);
+                    "a step of rotation, by the topic's name: a rotation vector"
+                        .clone_into(&mut group.reason);
                 } else if group.unit.as_deref() == Some("m/s") {
                     group.unit = Some("m".to_owned());
                     "a step of position, by the topic's name".clone_into(&mut group.reason);
@@ -621,9 +701,11 @@ fn add_actions(suggestion: &mut Suggestion, found: &[(&Topic, Guess)]) {
 }
 
 fn add_camera(suggestion: &mut Suggestion, topic: &Topic, survey: &Survey) {
-    let generic = ["image", "compressed", "compresseddepth", "raw", "color", "rgb", "camera", "cam", "video", "format"];
+    let generic =
+        ["image", "compressed", "compresseddepth", "raw", "color", "rgb", "camera", "cam", "video", "format"];
     let words = names::words(&topic.channel.topic.replace("compressedDepth", "depth"));
-    let mut kept: Vec<String> = words.iter().filter(|word| !generic.contains(&word.as_str())).cloned().collect();
+    let mut kept: Vec<String> =
+        words.iter().filter(|word| !generic.contains(&word.as_str())).cloned().collect();
     kept.dedup();
     let mut name = if kept.is_empty() { "camera".to_owned() } else { kept.join("_") };
     let taken = |name: &str, streams: &[StreamSpec]| {
@@ -632,7 +714,8 @@ fn add_camera(suggestion: &mut Suggestion, topic: &Topic, survey: &Survey) {
     if taken(&name, &suggestion.contract.stream) {
         name = words.join("_");
     }
-    let (mut stream, mut reasons) = base_stream(topic, &format!("observation.images.{name}"), RoleSpec::Image);
+    let (mut stream, mut reasons) =
+        base_stream(topic, &format!("observation.images.{name}"), RoleSpec::Image);
     let info = camera_info(topic, survey);
     if let Some(info) = &info {
         reasons.push(format!("calibration: {info}, the one nearest by its name"));
@@ -652,7 +735,11 @@ fn camera_info(topic: &Topic, survey: &Survey) -> Option<String> {
         let bare = other.type_name().rsplit(['/', '.']).next().unwrap_or("");
         matches!(bare, "CameraInfo" | "CameraCalibration")
     });
-    infos.map(|info| (shared(&info.channel.topic), info.channel.topic.clone())).filter(|(n, _)| *n > 0).max().map(|(_, name)| name)
+    infos
+        .map(|info| (shared(&info.channel.topic), info.channel.topic.clone()))
+        .filter(|(n, _)| *n > 0)
+        .max()
+        .map(|(_, name)| name)
 }
 
 /// A log without commands gets actions made from the state.
@@ -692,7 +779,8 @@ fn add_derived(suggestion: &mut Suggestion) {
         image: None,
     });
     suggestion.stream_reasons.push(vec![
-        "no command topic in the log: the action of a row is the state of the next one, marked as derived".to_owned(),
+        "no command topic in the log: the action of a row is the state of the next one, marked as derived"
+            .to_owned(),
     ]);
 }
 
@@ -718,7 +806,10 @@ fn set_rate(suggestion: &mut Suggestion, survey: &Survey) {
         rate = MAX_RATE_HZ;
     }
     let span_s = (survey.span_ns.1.saturating_sub(survey.span_ns.0)) as f64 / 1e9;
-    if span_s > 0.0 && span_s * rate < MIN_ROWS && let Some(fastest) = fastest.filter(|fastest| *fastest > rate) {
+    if span_s > 0.0
+        && span_s * rate < MIN_ROWS
+        && let Some(fastest) = fastest.filter(|fastest| *fastest > rate)
+    {
         let state = slowest(RoleSpec::State).unwrap_or(fastest);
         if state > rate {
             reason = format!("the log is {span_s:.2} s short, so the rate of the state: {state:.3} Hz");
@@ -729,8 +820,10 @@ fn set_rate(suggestion: &mut Suggestion, survey: &Survey) {
     let usual = USUAL_RATES_HZ.into_iter().find(|usual| (usual / rate - 1.0).abs() <= 0.05);
     let near = (rate.round() / rate - 1.0).abs() <= 0.05;
     let rounded = usual.unwrap_or(if near { rate.round() } else { rate.floor() });
-    let (rate_hz, fps) = if rounded >= 1.0 { (rounded, None) } else { ((rate * 1e4).round().max(100.0) / 1e4, Some(1)) };
-    suggestion.contract.ticks = TicksSpec { mode: TickMode::Fixed, rate_hz: Some(rate_hz), fps, stream: None };
+    let (rate_hz, fps) =
+        if rounded >= 1.0 { (rounded, None) } else { ((rate * 1e4).round().max(100.0) / 1e4, Some(1)) };
+    suggestion.contract.ticks =
+        TicksSpec { mode: TickMode::Fixed, rate_hz: Some(rate_hz), fps, stream: None };
     suggestion.reasons.insert("ticks", vec![reason]);
 }
 

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 
 use super::SuggestError;
-use crate::decode::{Decoded, DecodePlan, FieldInfo, RowSink, SchemaLibrary, StampSource, sample_fields};
+use crate::decode::{DecodePlan, Decoded, FieldInfo, RowSink, SchemaLibrary, StampSource, sample_fields};
 use crate::inspect::{ChannelProbe, ChannelReport, MessageProbe, inspect_log};
 use crate::log::{Channel, Log, OpenOptions, decompress_message, discover, looks_like_zstd};
 use crate::run::{OpenRecording, Source, schema_of};
@@ -98,7 +98,11 @@ impl Topic {
 }
 
 /// Looks at all logs.
-pub(crate) fn survey(inputs: &[PathBuf], library: &SchemaLibrary, options: &OpenOptions) -> Result<Survey, SuggestError> {
+pub(crate) fn survey(
+    inputs: &[PathBuf],
+    library: &SchemaLibrary,
+    options: &OpenOptions,
+) -> Result<Survey, SuggestError> {
     let found = discover(inputs);
     let mut reasons: Vec<String> = found.refused.iter().map(ToString::to_string).collect();
     let mut hint = found.refused.first().and_then(|error| error.hint());
@@ -132,10 +136,13 @@ pub(crate) fn survey(inputs: &[PathBuf], library: &SchemaLibrary, options: &Open
             }
         }
         for (name, topic) in seen {
-            topics.entry(name).and_modify(|known| {
-                known.messages += topic.messages;
-                known.recordings += 1;
-            }).or_insert(topic);
+            topics
+                .entry(name)
+                .and_modify(|known| {
+                    known.messages += topic.messages;
+                    known.recordings += 1;
+                })
+                .or_insert(topic);
         }
         if first.is_none() {
             first = Some(open);
@@ -161,8 +168,11 @@ pub(crate) fn survey(inputs: &[PathBuf], library: &SchemaLibrary, options: &Open
 }
 
 fn add_report(seen: &mut BTreeMap<String, Topic>, report: ChannelReport, open: &OpenRecording) {
-    let channel = open.channels.iter().find(|channel| channel.topic == report.topic && channel.id == report.id);
-    let Some(channel) = channel.or(open.channels.iter().find(|channel| channel.topic == report.topic)) else { return };
+    let channel =
+        open.channels.iter().find(|channel| channel.topic == report.topic && channel.id == report.id);
+    let Some(channel) = channel.or(open.channels.iter().find(|channel| channel.topic == report.topic)) else {
+        return;
+    };
     let ns = |time: Option<u64>| time.and_then(|ns| i64::try_from(ns).ok());
     let span_ns = (ns(report.start_ns).unwrap_or(0), ns(report.end_ns).unwrap_or(0));
     match seen.get_mut(&report.topic) {
@@ -246,7 +256,11 @@ impl Steps {
                 for message in &block.messages {
                     let topic = &block.channel(message).topic;
                     let ns = |time: u64| i64::try_from(time).unwrap_or(i64::MAX);
-                    let publish = if message.publish_time_ns == 0 { message.log_time_ns } else { message.publish_time_ns };
+                    let publish = if message.publish_time_ns == 0 {
+                        message.log_time_ns
+                    } else {
+                        message.publish_time_ns
+                    };
                     let pair = (ns(message.log_time_ns), ns(publish));
                     match times.get_mut(topic) {
                         Some(times) if times.len() < MAX_TIMES => times.push(pair),
@@ -269,7 +283,9 @@ impl Steps {
         let mut newest = i64::MIN;
         for index in 0..times.len() {
             if log(index) < newest {
-                let run = (index + 1..times.len()).take_while(|&at| log(at) >= log(at - 1) && log(at) < newest).count();
+                let run = (index + 1..times.len())
+                    .take_while(|&at| log(at) >= log(at - 1) && log(at) < newest)
+                    .count();
                 steps.push((index, newest.saturating_sub(log(index)) as f64 / 1e6, run));
                 if run >= RESET_RUN {
                     newest = log(index);
@@ -277,7 +293,8 @@ impl Steps {
             }
             newest = newest.max(log(index));
         }
-        let restarts: Vec<i64> = steps.iter().filter(|step| step.2 >= RESET_RUN).map(|step| log(step.0)).collect();
+        let restarts: Vec<i64> =
+            steps.iter().filter(|step| step.2 >= RESET_RUN).map(|step| log(step.0)).collect();
         let mut resets = Vec::new();
         for &(index, back_ms, run) in &steps {
             let is_known = restarts.iter().any(|&ns| (log(index) - ns).abs() < 1_000_000);
@@ -306,6 +323,8 @@ fn intervals(times: &[Times], resets: &[usize]) -> (f64, f64) {
         start = end;
     }
     all.sort_by(f64::total_cmp);
-    let at = |share: f64| all.get(((all.len().saturating_sub(1)) as f64 * share).round() as usize).copied().unwrap_or(0.0);
+    let at = |share: f64| {
+        all.get(((all.len().saturating_sub(1)) as f64 * share).round() as usize).copied().unwrap_or(0.0)
+    };
     (at(0.5), at(0.99))
 }
