@@ -28,6 +28,7 @@ pub use error::{Refusal, RunError};
 pub(crate) use picture::Picture;
 pub(crate) use plan::{Plans, schema_of};
 pub(crate) use recording::OpenRecording;
+pub(crate) use source::Source;
 pub use report::{FileReport, FileStatus, LostReport, Report, StreamReport, TopicReport};
 
 use crate::contract::{CheckedContract, to_toml};

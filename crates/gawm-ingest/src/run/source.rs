@@ -81,6 +81,14 @@ impl Source {
         Ok(Source::Log(Box::new(Log::open(path, &open_options(contract))?)))
     }
 
+    /// Returns the log, if it is one.
+    pub(crate) fn log(&self) -> Option<&Log> {
+        match self {
+            Source::Log(log) => Some(log),
+            Source::Table(_) => None,
+        }
+    }
+
     pub(crate) fn path(&self) -> &Path {
         match self {
             Source::Log(log) => log.path(),

@@ -10,7 +10,7 @@ use super::SuggestError;
 use crate::decode::{Decoded, DecodePlan, FieldInfo, RowSink, SchemaLibrary, StampSource, sample_fields};
 use crate::inspect::{ChannelProbe, ChannelReport, MessageProbe, inspect_log};
 use crate::log::{Channel, Log, OpenOptions, discover};
-use crate::run::{OpenRecording, schema_of};
+use crate::run::{OpenRecording, Source, schema_of};
 
 /// Payloads that are kept per topic.
 const SAMPLES: usize = 48;
@@ -116,9 +116,10 @@ pub(crate) fn survey(inputs: &[PathBuf], library: &SchemaLibrary, options: &Open
             }
         };
         recordings += 1;
-        let open = OpenRecording::of(recording.name.clone(), logs);
+        let sources = logs.into_iter().map(|log| Source::Log(Box::new(log))).collect();
+        let open = OpenRecording::of(recording.name.clone(), sources);
         let mut seen: BTreeMap<String, Topic> = BTreeMap::new();
-        for log in &open.logs {
+        for log in open.logs.iter().filter_map(Source::log) {
             for report in inspect_log(log, log.path(), &probe).channels {
                 add_report(&mut seen, report, &open);
             }
@@ -138,7 +139,7 @@ pub(crate) fn survey(inputs: &[PathBuf], library: &SchemaLibrary, options: &Open
     collect_samples(&first, &mut topics, library);
     let spans = topics.values().filter(|topic| topic.span_ns.0 > 0).map(|topic| topic.span_ns);
     let span_ns = spans.fold((i64::MAX, i64::MIN), |all, span| (all.0.min(span.0), all.1.max(span.1)));
-    let metadata = first.logs.iter().flat_map(Log::metadata);
+    let metadata = first.logs.iter().flat_map(Source::metadata);
     let metadata = metadata.map(|record| (record.name.clone(), record.values.clone())).collect();
     let urdf = super::urdf::texts(&first, &topics, library);
     Ok(Survey {
@@ -214,7 +215,7 @@ impl Steps {
     /// A step back is a reset when the topic then goes on from there, over times that it has been through before.
     fn look(&mut self, open: &OpenRecording) {
         let mut times: BTreeMap<String, Vec<i64>> = BTreeMap::new();
-        for (part, log) in open.logs.iter().enumerate() {
+        for (part, log) in open.logs.iter().filter_map(Source::log).enumerate() {
             if log.channels().len() > 10_000 || part > 64 {
                 continue;
             }

@@ -7,7 +7,7 @@ use regex::Regex;
 use super::survey::Topic;
 use crate::decode::{SchemaLibrary, decode_to_json};
 use crate::log::Log;
-use crate::run::{OpenRecording, schema_of};
+use crate::run::{OpenRecording, Source, schema_of};
 
 /// Largest description that is read.
 const MAX_BYTES: u64 = 16 << 20;
@@ -24,7 +24,7 @@ pub(crate) struct Joint {
 /// Returns the texts of robot descriptions in attachments and topics.
 pub(crate) fn texts(open: &OpenRecording, topics: &BTreeMap<String, Topic>, library: &SchemaLibrary) -> Vec<String> {
     let mut texts = Vec::new();
-    for log in &open.logs {
+    for log in open.logs.iter().filter_map(Source::log) {
         texts.extend(of_log(log));
     }
     for topic in topics.values().filter(|topic| topic.channel.topic.ends_with("robot_description")) {
