@@ -137,15 +137,34 @@ impl Dataset {
         if files.is_empty() {
             let reason = defects
                 .iter()
-                .find(|d| matches!(d.kind, DefectKind::UnreadableFile | DefectKind::MissingFile | DefectKind::UnsafePath))
-                .map_or("there are no Parquet files under data/".to_owned(), |d| format!("{}: {}", d.place, d.got));
+                .find(|d| {
+                    matches!(
+                        d.kind,
+                        DefectKind::UnreadableFile | DefectKind::MissingFile | DefectKind::UnsafePath
+                    )
+                })
+                .map_or("there are no Parquet files under data/".to_owned(), |d| {
+                    format!("{}: {}", d.place, d.got)
+                });
             return Err(OpenError::NoData { path: root.to_owned(), reason });
         }
         let runs = files::find_runs(&files, &info, &episodes, &limits, &mut defects);
         let stats = info::read_json(root, "meta/stats.json", &limits, &mut defects);
         let gawm = info::read_json(root, "meta/gawm.json", &limits, &mut defects);
         let schema = info::typed_schema(gawm.as_ref(), &mut defects);
-        Ok(Dataset { root: root.to_owned(), info, tasks, episodes, files, runs, stats, gawm, schema, defects, limits })
+        Ok(Dataset {
+            root: root.to_owned(),
+            info,
+            tasks,
+            episodes,
+            files,
+            runs,
+            stats,
+            gawm,
+            schema,
+            defects,
+            limits,
+        })
     }
 
     /// Returns the name of the folder, for people.

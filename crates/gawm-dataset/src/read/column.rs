@@ -1,12 +1,10 @@
 //! Columns of one run, filled from record batches.
 
 use arrow::{
-    array::{
-        Array, ArrayRef, AsArray, BooleanArray, FixedSizeListArray, GenericListArray, PrimitiveArray,
-    },
+    array::{Array, ArrayRef, AsArray, BooleanArray, FixedSizeListArray, GenericListArray, PrimitiveArray},
     datatypes::{
-        ArrowNativeType, ArrowNumericType, DataType, Float32Type, Float64Type, Int8Type, Int16Type, Int32Type, Int64Type, UInt8Type, UInt16Type,
-        UInt32Type, UInt64Type,
+        ArrowNativeType, ArrowNumericType, DataType, Float32Type, Float64Type, Int8Type, Int16Type,
+        Int32Type, Int64Type, UInt8Type, UInt16Type, UInt32Type, UInt64Type,
     },
 };
 
@@ -72,7 +70,12 @@ impl Column {
     }
 
     fn with(name: &str, values: ColumnValues) -> Column {
-        Column { name: name.to_owned(), values, nulls: RowNotes::default(), wrong_widths: RowNotes::default() }
+        Column {
+            name: name.to_owned(),
+            values,
+            nulls: RowNotes::default(),
+            wrong_widths: RowNotes::default(),
+        }
     }
 
     /// Returns the column emptied, of the same name, type and width.
@@ -105,7 +108,9 @@ impl Column {
         match &mut self.values {
             ColumnValues::Int(values) => append_ints(values, &mut self.nulls, array, from, to),
             ColumnValues::Text(values) => append_texts(values, &mut self.nulls, array, from, to),
-            ColumnValues::Vector(dims) => append_vector(dims, &mut self.nulls, &mut self.wrong_widths, array, from, to),
+            ColumnValues::Vector(dims) => {
+                append_vector(dims, &mut self.nulls, &mut self.wrong_widths, array, from, to)
+            }
         }
     }
 }
@@ -195,7 +200,9 @@ impl<'a> Layers<'a> {
         loop {
             let (layer, child) = match array.data_type() {
                 DataType::List(_) => (ListLayer::Small(array.as_list()), array.as_list::<i32>().values()),
-                DataType::LargeList(_) => (ListLayer::Large(array.as_list()), array.as_list::<i64>().values()),
+                DataType::LargeList(_) => {
+                    (ListLayer::Large(array.as_list()), array.as_list::<i64>().values())
+                }
                 DataType::FixedSizeList(..) => {
                     (ListLayer::Fixed(array.as_fixed_size_list()), array.as_fixed_size_list().values())
                 }
@@ -320,7 +327,9 @@ impl<'a> Leaf<'a> {
     /// Appends `n_rows` regular rows that begin at leaf position `start`; false if that is not possible.
     fn append_strided(&self, dims: &mut [Vec<f64>], start: usize, n_rows: usize) -> bool {
         match self {
-            Leaf::F32(a) if a.null_count() == 0 => append_strided(dims, &a.values()[start..], n_rows, f64::from),
+            Leaf::F32(a) if a.null_count() == 0 => {
+                append_strided(dims, &a.values()[start..], n_rows, f64::from)
+            }
             Leaf::F64(a) if a.null_count() == 0 => append_strided(dims, &a.values()[start..], n_rows, |v| v),
             _ => return false,
         }
@@ -328,7 +337,12 @@ impl<'a> Leaf<'a> {
     }
 }
 
-fn append_strided<T: Copy>(dims: &mut [Vec<f64>], values: &[T], n_rows: usize, to_float: impl Fn(T) -> f64 + Copy) {
+fn append_strided<T: Copy>(
+    dims: &mut [Vec<f64>],
+    values: &[T],
+    n_rows: usize,
+    to_float: impl Fn(T) -> f64 + Copy,
+) {
     let width = dims.len();
     for (dim, out) in dims.iter_mut().enumerate() {
         out.extend(values[dim..].iter().step_by(width).take(n_rows).map(|v| to_float(*v)));

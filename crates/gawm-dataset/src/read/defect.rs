@@ -57,7 +57,12 @@ pub struct Defect {
 
 impl Defect {
     /// Returns a defect that concerns the whole dataset.
-    pub fn new(kind: DefectKind, place: impl Into<String>, expected: impl Into<String>, got: impl Into<String>) -> Defect {
+    pub fn new(
+        kind: DefectKind,
+        place: impl Into<String>,
+        expected: impl Into<String>,
+        got: impl Into<String>,
+    ) -> Defect {
         Defect { kind, episode: None, place: place.into(), expected: expected.into(), got: got.into() }
     }
 

@@ -62,7 +62,12 @@ impl EpisodeEntry {
 }
 
 /// Reads the task table.
-pub(super) fn read_tasks(root: &Path, info: &Info, limits: &ReadLimits, defects: &mut Vec<Defect>) -> Vec<String> {
+pub(super) fn read_tasks(
+    root: &Path,
+    info: &Info,
+    limits: &ReadLimits,
+    defects: &mut Vec<Defect>,
+) -> Vec<String> {
     let place = if info.version.is_v2() { "meta/tasks.jsonl" } else { "meta/tasks.parquet" };
     let rows = if info.version.is_v2() { task_lines(root, limits) } else { task_rows(root) };
     let rows = match rows {
@@ -85,7 +90,12 @@ pub(super) fn read_tasks(root: &Path, info: &Info, limits: &ReadLimits, defects:
         && total != rows.len() as u64
     {
         let expected = format!("{} tasks as in {place}", rows.len());
-        defects.push(Defect::new(DefectKind::WrongCount, "meta/info.json total_tasks", expected, total.to_string()));
+        defects.push(Defect::new(
+            DefectKind::WrongCount,
+            "meta/info.json total_tasks",
+            expected,
+            total.to_string(),
+        ));
     }
     let mut tasks = vec![String::new(); rows.len()];
     for (index, text) in rows {
@@ -103,7 +113,10 @@ fn task_lines(root: &Path, limits: &ReadLimits) -> Result<TaskRows, String> {
     let mut rows = Vec::new();
     for (n, line) in text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty()) {
         let value: Value = serde_json::from_str(line).map_err(|e| format!("line {}: {e}", n + 1))?;
-        let index = value.get("task_index").and_then(Value::as_i64).ok_or_else(|| format!("line {} without task_index", n + 1))?;
+        let index = value
+            .get("task_index")
+            .and_then(Value::as_i64)
+            .ok_or_else(|| format!("line {} without task_index", n + 1))?;
         rows.push((index, value.get("task").and_then(Value::as_str).unwrap_or("").to_owned()));
     }
     Ok((rows, Vec::new()))
@@ -115,10 +128,14 @@ fn task_rows(root: &Path) -> Result<TaskRows, String> {
     let has_index = |s: &Schema| s.metadata().get("pandas").is_some_and(|p| p.contains("index_columns"));
     let mut complaints = Vec::new();
     if !has_index(&schema) {
-        complaints.push(("pandas metadata with the task text as index", "none: lerobot shows the number 1 as task".to_owned()));
+        complaints.push((
+            "pandas metadata with the task text as index",
+            "none: lerobot shows the number 1 as task".to_owned(),
+        ));
     }
     // pandas names an index without a name __index_level_0__.
-    let text_column = ["task", "__index_level_0__"].into_iter().find(|name| schema.field_with_name(name).is_ok());
+    let text_column =
+        ["task", "__index_level_0__"].into_iter().find(|name| schema.field_with_name(name).is_ok());
     let text_column = text_column.ok_or("no column task")?;
     let mut rows = Vec::new();
     for batch in &batches {
@@ -130,8 +147,17 @@ fn task_rows(root: &Path) -> Result<TaskRows, String> {
 }
 
 /// Reads the episode table.
-pub(super) fn read_episodes(root: &Path, info: &Info, limits: &ReadLimits, defects: &mut Vec<Defect>) -> Vec<EpisodeEntry> {
-    let entries = if info.version.is_v2() { episode_lines(root, info, limits) } else { episode_rows(root, limits, defects) };
+pub(super) fn read_episodes(
+    root: &Path,
+    info: &Info,
+    limits: &ReadLimits,
+    defects: &mut Vec<Defect>,
+) -> Vec<EpisodeEntry> {
+    let entries = if info.version.is_v2() {
+        episode_lines(root, info, limits)
+    } else {
+        episode_rows(root, limits, defects)
+    };
     let place = if info.version.is_v2() { "meta/episodes.jsonl" } else { "meta/episodes" };
     let entries = entries.unwrap_or_else(|got| {
         defects.push(Defect::new(DefectKind::EpisodeTable, place, "a table of episodes", got));
@@ -140,7 +166,9 @@ pub(super) fn read_episodes(root: &Path, info: &Info, limits: &ReadLimits, defec
     if let Some((i, entry)) = entries.iter().enumerate().find(|(i, e)| e.episode_index != *i as i64) {
         let expected = format!("row {i} to be episode {i}: lookup is by position");
         let got = format!("episode {}", entry.episode_index);
-        defects.push(Defect::new(DefectKind::EpisodeTable, place, expected, got).in_episode(entry.episode_index));
+        defects.push(
+            Defect::new(DefectKind::EpisodeTable, place, expected, got).in_episode(entry.episode_index),
+        );
     }
     entries
 }
@@ -167,25 +195,38 @@ fn episode_lines(root: &Path, info: &Info, limits: &ReadLimits) -> Result<Vec<Ep
         };
         from = from.saturating_add(length.unwrap_or(0));
         entry.to_index = Some(from);
-        for (key, value) in object.iter().filter(|(k, _)| !["episode_index", "length", "tasks"].contains(&k.as_str())) {
+        for (key, value) in
+            object.iter().filter(|(k, _)| !["episode_index", "length", "tasks"].contains(&k.as_str()))
+        {
             entry.extras.insert(key.clone(), value.clone());
         }
         for feature in info.features.iter().filter(|f| f.dtype == super::DType::Video) {
             let to = length.unwrap_or(0) as f64 / info.fps;
-            entry.videos.insert(feature.name.clone(), VideoSpan { chunk, to_timestamp_secs: to, ..VideoSpan::default() });
+            entry.videos.insert(
+                feature.name.clone(),
+                VideoSpan { chunk, to_timestamp_secs: to, ..VideoSpan::default() },
+            );
         }
         entries.push(entry);
     }
     Ok(entries)
 }
 
-fn episode_rows(root: &Path, limits: &ReadLimits, defects: &mut Vec<Defect>) -> Result<Vec<EpisodeEntry>, String> {
+fn episode_rows(
+    root: &Path,
+    limits: &ReadLimits,
+    defects: &mut Vec<Defect>,
+) -> Result<Vec<EpisodeEntry>, String> {
     let folder = root.join("meta/episodes");
     let mut names = Vec::new();
     let list = |path: &Path| std::fs::read_dir(path).into_iter().flatten().flatten().collect::<Vec<_>>();
     for chunk in list(&folder) {
         for file in list(&chunk.path()) {
-            let name = format!("meta/episodes/{}/{}", chunk.file_name().to_string_lossy(), file.file_name().to_string_lossy());
+            let name = format!(
+                "meta/episodes/{}/{}",
+                chunk.file_name().to_string_lossy(),
+                file.file_name().to_string_lossy()
+            );
             if name.ends_with(".parquet") {
                 names.push(name);
             }
@@ -197,7 +238,8 @@ fn episode_rows(root: &Path, limits: &ReadLimits, defects: &mut Vec<Defect>) -> 
     }
     let mut entries = Vec::new();
     for name in names {
-        let table = paths::join_inside(root, &name).and_then(|path| read_table(&path, |column| !column.starts_with("stats/")));
+        let table = paths::join_inside(root, &name)
+            .and_then(|path| read_table(&path, |column| !column.starts_with("stats/")));
         let (batches, _) = match table {
             Ok(table) => table,
             Err(got) => {
@@ -217,7 +259,9 @@ fn episode_rows(root: &Path, limits: &ReadLimits, defects: &mut Vec<Defect>) -> 
 
 fn entries_of(batch: &RecordBatch) -> Result<Vec<EpisodeEntry>, String> {
     let index = ints(batch, "episode_index").ok_or("no column episode_index")?;
-    let count = |name: &str| ints(batch, name).map(|v| v.into_iter().map(|n| u64::try_from(n).ok()).collect::<Vec<_>>());
+    let count = |name: &str| {
+        ints(batch, name).map(|v| v.into_iter().map(|n| u64::try_from(n).ok()).collect::<Vec<_>>())
+    };
     let (length, chunk, file) = (count("length"), count("data/chunk_index"), count("data/file_index"));
     let (from, to) = (count("dataset_from_index"), count("dataset_to_index"));
     let at = |column: &Option<Vec<Option<u64>>>, i: usize| column.as_ref().and_then(|c| c[i]);
@@ -232,7 +276,14 @@ fn entries_of(batch: &RecordBatch) -> Result<Vec<EpisodeEntry>, String> {
             ..EpisodeEntry::default()
         })
         .collect();
-    let own = ["episode_index", "length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index"];
+    let own = [
+        "episode_index",
+        "length",
+        "data/chunk_index",
+        "data/file_index",
+        "dataset_from_index",
+        "dataset_to_index",
+    ];
     for (field, array) in batch.schema().fields().iter().zip(batch.columns()) {
         let name = field.name().as_str();
         if own.contains(&name) || name.starts_with("meta/") {
@@ -319,7 +370,13 @@ fn read_table(path: &Path, wants: impl Fn(&str) -> bool) -> Result<(Vec<RecordBa
 }
 
 /// Compares the runs of rows with the episode table and the counts in `meta/info.json`.
-pub(super) fn compare(files: &[DataFile], runs: &[Run], info: &Info, entries: &[EpisodeEntry], defects: &mut Vec<Defect>) {
+pub(super) fn compare(
+    files: &[DataFile],
+    runs: &[Run],
+    info: &Info,
+    entries: &[EpisodeEntry],
+    defects: &mut Vec<Defect>,
+) {
     let mut listed: Vec<Defect> = Vec::new();
     let mut by_episode: BTreeMap<i64, Vec<&Run>> = BTreeMap::new();
     for run in runs {
@@ -327,42 +384,77 @@ pub(super) fn compare(files: &[DataFile], runs: &[Run], info: &Info, entries: &[
     }
     for (episode, runs) in by_episode.iter().filter(|(_, runs)| runs.len() > 1) {
         let got = format!("{} separate stretches", runs.len());
-        listed.push(Defect::new(DefectKind::BrokenRuns, &files[runs[1].file].relative, "all its rows together", got).in_episode(*episode));
+        listed.push(
+            Defect::new(DefectKind::BrokenRuns, &files[runs[1].file].relative, "all its rows together", got)
+                .in_episode(*episode),
+        );
     }
     for pair in runs.windows(2).filter(|pair| pair[1].episode_index < pair[0].episode_index) {
         let expected = format!("an episode after {}", pair[0].episode_index);
-        let defect = Defect::new(DefectKind::BrokenRuns, &files[pair[1].file].relative, expected, pair[1].episode_index.to_string());
+        let defect = Defect::new(
+            DefectKind::BrokenRuns,
+            &files[pair[1].file].relative,
+            expected,
+            pair[1].episode_index.to_string(),
+        );
         listed.push(defect.in_episode(pair[1].episode_index));
     }
     let expected_indices = by_episode.keys().copied().eq(0..by_episode.len() as i64);
     if !expected_indices {
         let first = by_episode.keys().enumerate().find(|(i, e)| *i as i64 != **e).map_or(0, |(_, e)| *e);
         let expected = format!("episode_index 0 to {} without gaps", by_episode.len().saturating_sub(1));
-        listed.push(Defect::new(DefectKind::BrokenRuns, "column episode_index", expected, format!("a jump to {first}")));
+        listed.push(Defect::new(
+            DefectKind::BrokenRuns,
+            "column episode_index",
+            expected,
+            format!("a jump to {first}"),
+        ));
     }
     let known: BTreeMap<i64, &EpisodeEntry> = entries.iter().map(|e| (e.episode_index, e)).collect();
     for (episode, runs) in &by_episode {
         let Some(entry) = known.get(episode) else {
             if !entries.is_empty() {
-                listed.push(Defect::new(DefectKind::EpisodeTable, "episode table", "an entry", "none").in_episode(*episode));
+                listed.push(
+                    Defect::new(DefectKind::EpisodeTable, "episode table", "an entry", "none")
+                        .in_episode(*episode),
+                );
             }
             continue;
         };
         let n_rows: u64 = runs.iter().map(|r| r.n_rows).sum();
         if entry.length != Some(n_rows) {
             let got = entry.length.map_or("nothing".to_owned(), |n| n.to_string());
-            listed.push(Defect::new(DefectKind::EpisodeTable, "episode table: length", format!("{n_rows} as in the data"), got).in_episode(*episode));
+            listed.push(
+                Defect::new(
+                    DefectKind::EpisodeTable,
+                    "episode table: length",
+                    format!("{n_rows} as in the data"),
+                    got,
+                )
+                .in_episode(*episode),
+            );
         } else if !info.version.is_v2() && runs.len() == 1 {
             let (from, to) = (runs[0].global_start, runs[0].global_start + n_rows);
             if (entry.from_index, entry.to_index) != (Some(from), Some(to)) {
                 let got = format!("{:?} to {:?}", entry.from_index.unwrap_or(0), entry.to_index.unwrap_or(0));
                 let expected = format!("rows {from} to {to}");
-                listed.push(Defect::new(DefectKind::EpisodeTable, "episode table: dataset_from_index, dataset_to_index", expected, got).in_episode(*episode));
+                listed.push(
+                    Defect::new(
+                        DefectKind::EpisodeTable,
+                        "episode table: dataset_from_index, dataset_to_index",
+                        expected,
+                        got,
+                    )
+                    .in_episode(*episode),
+                );
             }
         }
     }
     for entry in entries.iter().filter(|e| !by_episode.contains_key(&e.episode_index)) {
-        listed.push(Defect::new(DefectKind::EpisodeTable, "episode table", "rows in the data", "none").in_episode(entry.episode_index));
+        listed.push(
+            Defect::new(DefectKind::EpisodeTable, "episode table", "rows in the data", "none")
+                .in_episode(entry.episode_index),
+        );
     }
     let n_left_out = listed.len().saturating_sub(MAX_LISTED);
     listed.truncate(MAX_LISTED);
@@ -372,12 +464,18 @@ pub(super) fn compare(files: &[DataFile], runs: &[Run], info: &Info, entries: &[
         defects.push(Defect::new(DefectKind::EpisodeTable, "episode table", "agreement with the data", got));
     }
     let n_rows: u64 = files.iter().map(|f| f.n_rows).sum();
-    for (key, declared, actual) in
-        [("total_frames", info.total_frames, n_rows), ("total_episodes", info.total_episodes, by_episode.len() as u64)]
-    {
+    for (key, declared, actual) in [
+        ("total_frames", info.total_frames, n_rows),
+        ("total_episodes", info.total_episodes, by_episode.len() as u64),
+    ] {
         if let Some(declared) = declared.filter(|d| *d != actual) {
             let place = format!("meta/info.json {key}");
-            defects.push(Defect::new(DefectKind::WrongCount, place, format!("{actual} as in the data"), declared.to_string()));
+            defects.push(Defect::new(
+                DefectKind::WrongCount,
+                place,
+                format!("{actual} as in the data"),
+                declared.to_string(),
+            ));
         }
     }
 }

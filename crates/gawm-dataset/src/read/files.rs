@@ -8,8 +8,10 @@ use std::{
 };
 
 use arrow::datatypes::{DataType, SchemaRef};
-use parquet::arrow::arrow_reader::{ArrowReaderMetadata, ArrowReaderOptions, ParquetRecordBatchReaderBuilder};
 use parquet::arrow::ProjectionMask;
+use parquet::arrow::arrow_reader::{
+    ArrowReaderMetadata, ArrowReaderOptions, ParquetRecordBatchReaderBuilder,
+};
 use rayon::prelude::*;
 
 use super::{
@@ -55,7 +57,8 @@ const MAX_CHUNK_BYTES: i64 = 8 << 30;
 
 /// Runs `read`, turning errors and panics of the Parquet reader into text.
 pub(super) fn guarded<T>(read: impl FnOnce() -> Result<T, String>) -> Result<T, String> {
-    catch_unwind(AssertUnwindSafe(read)).unwrap_or_else(|_| Err("content that the Parquet reader cannot digest".to_owned()))
+    catch_unwind(AssertUnwindSafe(read))
+        .unwrap_or_else(|_| Err("content that the Parquet reader cannot digest".to_owned()))
 }
 
 /// Opens a Parquet file and checks its footer against the file's size.
@@ -66,18 +69,29 @@ pub(super) fn open_parquet(path: &Path) -> Result<(File, ArrowReaderMetadata), S
         return Err("something that is not a regular file".to_owned());
     }
     let size = size.len();
-    let metadata = guarded(|| ArrowReaderMetadata::load(&file, ArrowReaderOptions::new()).map_err(|e| e.to_string()))?;
+    let metadata =
+        guarded(|| ArrowReaderMetadata::load(&file, ArrowReaderOptions::new()).map_err(|e| e.to_string()))?;
     let mut n_rows: i64 = 0;
     for group in metadata.metadata().row_groups() {
-        n_rows = n_rows.checked_add(group.num_rows()).filter(|_| group.num_rows() >= 0).ok_or("negative row counts")?;
+        n_rows = n_rows
+            .checked_add(group.num_rows())
+            .filter(|_| group.num_rows() >= 0)
+            .ok_or("negative row counts")?;
         for column in group.columns() {
             let start = column.dictionary_page_offset().unwrap_or_else(|| column.data_page_offset());
             let end = start.checked_add(column.compressed_size());
             if column.uncompressed_size() > MAX_CHUNK_BYTES {
-                return Err(format!("a column chunk of {} bytes (column {})", column.uncompressed_size(), column.column_path()));
+                return Err(format!(
+                    "a column chunk of {} bytes (column {})",
+                    column.uncompressed_size(),
+                    column.column_path()
+                ));
             }
             if start < 4 || column.compressed_size() < 0 || end.is_none_or(|end| end as u64 > size) {
-                return Err(format!("a footer that points outside the file (column {})", column.column_path()));
+                return Err(format!(
+                    "a footer that points outside the file (column {})",
+                    column.column_path()
+                ));
             }
         }
     }
@@ -89,16 +103,31 @@ pub(super) fn open_parquet(path: &Path) -> Result<(File, ArrowReaderMetadata), S
 }
 
 /// Lists and opens the data files, comparing them with what metadata name.
-pub(super) fn find_data_files(root: &Path, info: &Info, episodes: &[EpisodeEntry], defects: &mut Vec<Defect>) -> Vec<DataFile> {
+pub(super) fn find_data_files(
+    root: &Path,
+    info: &Info,
+    episodes: &[EpisodeEntry],
+    defects: &mut Vec<Defect>,
+) -> Vec<DataFile> {
     let mut named = BTreeSet::new();
     for entry in episodes {
-        let values = TemplateValues { chunk: entry.data_chunk, file: entry.data_file, episode: entry.episode_index as u64, video_key: "" };
+        let values = TemplateValues {
+            chunk: entry.data_chunk,
+            file: entry.data_file,
+            episode: entry.episode_index as u64,
+            video_key: "",
+        };
         match paths::fill(&info.data_path, values).and_then(|p| paths::join_inside(root, &p).map(|_| p)) {
             Ok(path) => {
                 named.insert(path);
             }
             Err(got) => {
-                defects.push(Defect::new(DefectKind::UnsafePath, "meta/info.json data_path", "a path inside the folder", got));
+                defects.push(Defect::new(
+                    DefectKind::UnsafePath,
+                    "meta/info.json data_path",
+                    "a path inside the folder",
+                    got,
+                ));
                 break;
             }
         }
@@ -108,19 +137,34 @@ pub(super) fn find_data_files(root: &Path, info: &Info, episodes: &[EpisodeEntry
     let n_missing = missing.len();
     missing.truncate(20);
     for path in missing {
-        let got = if n_missing > 20 { format!("nothing ({n_missing} files are missing)") } else { "nothing".to_owned() };
-        defects.push(Defect::new(DefectKind::MissingFile, path, "a Parquet file that the episode table names", got));
+        let got = if n_missing > 20 {
+            format!("nothing ({n_missing} files are missing)")
+        } else {
+            "nothing".to_owned()
+        };
+        defects.push(Defect::new(
+            DefectKind::MissingFile,
+            path,
+            "a Parquet file that the episode table names",
+            got,
+        ));
     }
     if !named.is_empty() {
         for path in found.difference(&named) {
-            defects.push(Defect::new(DefectKind::StrayFile, path, "only files that the episode table names", "another one"));
+            defects.push(Defect::new(
+                DefectKind::StrayFile,
+                path,
+                "only files that the episode table names",
+                "another one",
+            ));
         }
     }
     // A stray file in a LeRobot v2 folder is not read by anyone; in v3 every file is.
     let mut wanted: Vec<&String> =
         found.iter().filter(|p| !info.version.is_v2() || named.is_empty() || named.contains(*p)).collect();
     wanted.sort_by_key(|path| natural_key(path));
-    let opened: Vec<Result<DataFile, Defect>> = wanted.par_iter().map(|relative| open_data_file(root, relative)).collect();
+    let opened: Vec<Result<DataFile, Defect>> =
+        wanted.par_iter().map(|relative| open_data_file(root, relative)).collect();
     let mut files = Vec::new();
     for file in opened {
         match file {
@@ -141,7 +185,8 @@ fn natural_key(path: &str) -> (Vec<u64>, String) {
 /// Lists `data/*/*.parquet`, as LeRobot globs it.
 fn list_parquet(root: &Path, defects: &mut Vec<Defect>) -> Vec<String> {
     let mut found = Vec::new();
-    let read = |path: &Path| -> Vec<fs::DirEntry> { fs::read_dir(path).into_iter().flatten().flatten().collect() };
+    let read =
+        |path: &Path| -> Vec<fs::DirEntry> { fs::read_dir(path).into_iter().flatten().flatten().collect() };
     for chunk in read(&root.join("data")) {
         let chunk_name = chunk.file_name().to_string_lossy().into_owned();
         if !chunk.path().is_dir() {
@@ -155,7 +200,12 @@ fn list_parquet(root: &Path, defects: &mut Vec<Defect>) -> Vec<String> {
             }
             match paths::join_inside(root, &relative) {
                 Ok(_) => found.push(relative),
-                Err(got) => defects.push(Defect::new(DefectKind::UnsafePath, relative, "a file inside the folder", got)),
+                Err(got) => defects.push(Defect::new(
+                    DefectKind::UnsafePath,
+                    relative,
+                    "a file inside the folder",
+                    got,
+                )),
             }
         }
     }
@@ -165,8 +215,8 @@ fn list_parquet(root: &Path, defects: &mut Vec<Defect>) -> Vec<String> {
 
 fn open_data_file(root: &Path, relative: &str) -> Result<DataFile, Defect> {
     let path = root.join(relative);
-    let (_, metadata) =
-        open_parquet(&path).map_err(|got| Defect::new(DefectKind::UnreadableFile, relative, "a readable Parquet file", got))?;
+    let (_, metadata) = open_parquet(&path)
+        .map_err(|got| Defect::new(DefectKind::UnreadableFile, relative, "a readable Parquet file", got))?;
     Ok(DataFile {
         relative: relative.to_owned(),
         path,
@@ -180,14 +230,21 @@ fn open_data_file(root: &Path, relative: &str) -> Result<DataFile, Defect> {
 fn check_columns(files: &[DataFile], info: &Info, defects: &mut Vec<Defect>) {
     let mut seen: BTreeMap<(DefectKind, String, String), (usize, String, String)> = BTreeMap::new();
     let mut note = |kind, name: &str, expected: String, got: String, file: &DataFile| {
-        let entry = seen.entry((kind, name.to_owned(), got.clone())).or_insert((0, expected, file.relative.clone()));
+        let entry =
+            seen.entry((kind, name.to_owned(), got.clone())).or_insert((0, expected, file.relative.clone()));
         entry.0 += 1;
     };
     for file in files {
         for field in file.schema.fields() {
             if info.feature(field.name()).is_none() {
                 let got = field.data_type().to_string();
-                note(DefectKind::UndeclaredColumn, field.name(), "a declaration in features".to_owned(), got, file);
+                note(
+                    DefectKind::UndeclaredColumn,
+                    field.name(),
+                    "a declaration in features".to_owned(),
+                    got,
+                    file,
+                );
             }
         }
         for name in INDEX_COLUMNS {
@@ -199,18 +256,34 @@ fn check_columns(files: &[DataFile], info: &Info, defects: &mut Vec<Defect>) {
         for feature in info.features.iter().filter(|f| f.dtype != DType::Video) {
             match file.schema.field_with_name(&feature.name) {
                 Err(_) => {
-                    note(DefectKind::MissingColumn, &feature.name, "the declared column".to_owned(), "none".to_owned(), file);
+                    note(
+                        DefectKind::MissingColumn,
+                        &feature.name,
+                        "the declared column".to_owned(),
+                        "none".to_owned(),
+                        file,
+                    );
                 }
                 Ok(field) => {
                     if let Some(expected) = wrong_type(feature, field.data_type()) {
-                        note(DefectKind::WrongType, &feature.name, expected, field.data_type().to_string(), file);
+                        note(
+                            DefectKind::WrongType,
+                            &feature.name,
+                            expected,
+                            field.data_type().to_string(),
+                            file,
+                        );
                     }
                 }
             }
         }
     }
     for ((kind, name, got), (n_files, expected, first)) in seen {
-        let got = if n_files > 1 { format!("{got} (in {n_files} files, first {first})") } else { format!("{got} (in {first})") };
+        let got = if n_files > 1 {
+            format!("{got} (in {n_files} files, first {first})")
+        } else {
+            format!("{got} (in {first})")
+        };
         defects.push(Defect::new(kind, name, expected, got));
     }
 }
@@ -284,17 +357,24 @@ pub(super) fn find_runs(
     runs
 }
 
-fn runs_of_file(file: &DataFile, info: &Info, episodes: &[EpisodeEntry], limits: &ReadLimits) -> Result<Vec<(i64, u64)>, Defect> {
+fn runs_of_file(
+    file: &DataFile,
+    info: &Info,
+    episodes: &[EpisodeEntry],
+    limits: &ReadLimits,
+) -> Result<Vec<(i64, u64)>, Defect> {
     if file.schema.field_with_name("episode_index").is_err() {
         return Ok(runs_from_table(file, info, episodes));
     }
-    let unreadable = |got| Defect::new(DefectKind::UnreadableFile, &file.relative, "a readable column episode_index", got);
+    let unreadable =
+        |got| Defect::new(DefectKind::UnreadableFile, &file.relative, "a readable column episode_index", got);
     let mut runs: Vec<(i64, u64)> = Vec::new();
     guarded(|| {
         let (handle, metadata) = open_parquet(&file.path)?;
         let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(handle, metadata);
         let mask = ProjectionMask::columns(builder.parquet_schema(), ["episode_index"]);
-        let reader = builder.with_projection(mask).with_batch_size(65_536).build().map_err(|e| e.to_string())?;
+        let reader =
+            builder.with_projection(mask).with_batch_size(65_536).build().map_err(|e| e.to_string())?;
         for batch in reader {
             let batch = batch.map_err(|e| e.to_string())?;
             let mut column = Column::int("episode_index");
@@ -317,7 +397,9 @@ fn runs_of_file(file: &DataFile, info: &Info, episodes: &[EpisodeEntry], limits:
 
 /// Returns runs of a file without the column `episode_index`, by its name (v2) or the episode table (v3).
 fn runs_from_table(file: &DataFile, info: &Info, episodes: &[EpisodeEntry]) -> Vec<(i64, u64)> {
-    let number = |text: &str| text.chars().filter(char::is_ascii_digit).collect::<String>().parse::<u64>().unwrap_or(0);
+    let number = |text: &str| {
+        text.chars().filter(char::is_ascii_digit).collect::<String>().parse::<u64>().unwrap_or(0)
+    };
     let name = file.relative.rsplit('/').next().unwrap_or("");
     if info.version.is_v2() {
         return vec![(number(name) as i64, file.n_rows)];

@@ -10,7 +10,10 @@ use bytes::Bytes;
 use parquet::{
     arrow::{
         ProjectionMask,
-        arrow_reader::{ArrowReaderMetadata, ArrowReaderOptions, ParquetRecordBatchReaderBuilder, RowSelection, RowSelector},
+        arrow_reader::{
+            ArrowReaderMetadata, ArrowReaderOptions, ParquetRecordBatchReaderBuilder, RowSelection,
+            RowSelector,
+        },
     },
     file::metadata::PageIndexPolicy,
 };
@@ -60,11 +63,15 @@ impl Dataset {
         let defects = Mutex::new(Vec::new());
         let read = |unit: &Unit| {
             let mut results = Vec::new();
-            let outcome = files::guarded(|| self.read_frames_of_unit(unit, cameras, &begin, &progress, &mut results));
+            let outcome =
+                files::guarded(|| self.read_frames_of_unit(unit, cameras, &begin, &progress, &mut results));
             if let Err(got) = outcome {
                 let place = &self.files[unit.file].relative;
                 let defect = Defect::new(DefectKind::UnreadableFile, place, "readable frames", got);
-                defects.lock().unwrap_or_else(std::sync::PoisonError::into_inner).push((unit.runs.start, defect));
+                defects
+                    .lock()
+                    .unwrap_or_else(std::sync::PoisonError::into_inner)
+                    .push((unit.runs.start, defect));
             }
             results
         };
@@ -95,7 +102,8 @@ impl Dataset {
         let mut state: Option<F> = None;
         for batch in self.open_unit(unit, &names, BATCH_FRAMES)? {
             let batch = batch.map_err(|e| e.to_string())?;
-            let arrays: Vec<Option<&ArrayRef>> = names.iter().map(|name| batch.column_by_name(name)).collect();
+            let arrays: Vec<Option<&ArrayRef>> =
+                names.iter().map(|name| batch.column_by_name(name)).collect();
             for i in 0..batch.num_rows() {
                 if runs.is_empty() {
                     break;
@@ -150,7 +158,12 @@ impl Dataset {
     ///
     /// # Errors
     /// The file cannot be read, or has no such column; the text says which.
-    pub fn read_frames(&self, run_index: usize, camera: &str, rows: &[usize]) -> Result<Vec<FrameBytes>, String> {
+    pub fn read_frames(
+        &self,
+        run_index: usize,
+        camera: &str,
+        rows: &[usize],
+    ) -> Result<Vec<FrameBytes>, String> {
         let run = &self.runs[run_index];
         let file = &self.files[run.file];
         let (handle, _) = files::open_parquet(&file.path)?;

@@ -150,7 +150,8 @@ impl Info {
 
 /// Reads a text file of at most the permitted size.
 pub(super) fn read_text(root: &Path, relative: &str, limits: &ReadLimits) -> io::Result<String> {
-    let path = paths::join_inside(root, relative).map_err(|got| io::Error::new(io::ErrorKind::PermissionDenied, got))?;
+    let path = paths::join_inside(root, relative)
+        .map_err(|got| io::Error::new(io::ErrorKind::PermissionDenied, got))?;
     let file = File::open(&path)?;
     if !file.metadata()?.is_file() {
         return Err(io::Error::new(io::ErrorKind::InvalidInput, "expected a regular file"));
@@ -158,26 +159,45 @@ pub(super) fn read_text(root: &Path, relative: &str, limits: &ReadLimits) -> io:
     let mut text = Vec::new();
     let n = file.take(limits.max_json_bytes + 1).read_to_end(&mut text)?;
     if n as u64 > limits.max_json_bytes {
-        return Err(io::Error::new(io::ErrorKind::FileTooLarge, format!("expected at most {} bytes", limits.max_json_bytes)));
+        return Err(io::Error::new(
+            io::ErrorKind::FileTooLarge,
+            format!("expected at most {} bytes", limits.max_json_bytes),
+        ));
     }
-    let text = String::from_utf8(text).map_err(|e| io::Error::new(io::ErrorKind::InvalidData, e.to_string()))?;
+    let text =
+        String::from_utf8(text).map_err(|e| io::Error::new(io::ErrorKind::InvalidData, e.to_string()))?;
     Ok(text.strip_prefix('\u{feff}').map(str::to_owned).unwrap_or(text))
 }
 
 /// Reads an optional JSON file; a broken one is a defect.
-pub(super) fn read_json(root: &Path, relative: &str, limits: &ReadLimits, defects: &mut Vec<Defect>) -> Option<Value> {
+pub(super) fn read_json(
+    root: &Path,
+    relative: &str,
+    limits: &ReadLimits,
+    defects: &mut Vec<Defect>,
+) -> Option<Value> {
     let text = match read_text(root, relative, limits) {
         Ok(text) => text,
         Err(e) if e.kind() == io::ErrorKind::NotFound => return None,
         Err(e) => {
-            defects.push(Defect::new(DefectKind::BadMetadata, relative, "a readable JSON file", e.to_string()));
+            defects.push(Defect::new(
+                DefectKind::BadMetadata,
+                relative,
+                "a readable JSON file",
+                e.to_string(),
+            ));
             return None;
         }
     };
     match serde_json::from_str(&text) {
         Ok(value) => Some(value),
         Err(e) => {
-            defects.push(Defect::new(DefectKind::BadMetadata, relative, "JSON (NaN and Infinity are not)", e.to_string()));
+            defects.push(Defect::new(
+                DefectKind::BadMetadata,
+                relative,
+                "JSON (NaN and Infinity are not)",
+                e.to_string(),
+            ));
             None
         }
     }
@@ -189,16 +209,30 @@ pub(super) fn typed_schema(gawm: Option<&Value>, defects: &mut Vec<Defect>) -> O
     match serde_json::from_value(schema.clone()) {
         Ok(schema) => Some(schema),
         Err(e) => {
-            defects.push(Defect::new(DefectKind::BadMetadata, "meta/gawm.json schema", "a gawm schema", e.to_string()));
+            defects.push(Defect::new(
+                DefectKind::BadMetadata,
+                "meta/gawm.json schema",
+                "a gawm schema",
+                e.to_string(),
+            ));
             None
         }
     }
 }
 
 /// Reads `meta/info.json`.
-pub(super) fn read_info(root: &Path, limits: &ReadLimits, defects: &mut Vec<Defect>) -> Result<Info, OpenError> {
-    let text = read_text(root, "meta/info.json", limits).map_err(|source| OpenError::Info { path: root.to_owned(), source })?;
-    let bad = |expected: &str, got: String| OpenError::BadInfo { path: root.to_owned(), expected: expected.to_owned(), got };
+pub(super) fn read_info(
+    root: &Path,
+    limits: &ReadLimits,
+    defects: &mut Vec<Defect>,
+) -> Result<Info, OpenError> {
+    let text = read_text(root, "meta/info.json", limits)
+        .map_err(|source| OpenError::Info { path: root.to_owned(), source })?;
+    let bad = |expected: &str, got: String| OpenError::BadInfo {
+        path: root.to_owned(),
+        expected: expected.to_owned(),
+        got,
+    };
     if text.trim().is_empty() {
         return Err(bad("a JSON object", "an empty file".to_owned()));
     }
@@ -220,7 +254,8 @@ pub(super) fn read_info(root: &Path, limits: &ReadLimits, defects: &mut Vec<Defe
         .get("features")
         .and_then(Value::as_object)
         .ok_or_else(|| bad("features, an object", "none".to_owned()))?;
-    let features = features.iter().filter_map(|(name, value)| feature_decl(name, value, limits, defects)).collect();
+    let features =
+        features.iter().filter_map(|(name, value)| feature_decl(name, value, limits, defects)).collect();
     let default_data_path = if version.is_v2() {
         "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
     } else {
@@ -234,11 +269,17 @@ pub(super) fn read_info(root: &Path, limits: &ReadLimits, defects: &mut Vec<Defe
         }
         value
     };
-    let (total_episodes, total_frames, total_tasks) = (count("total_episodes"), count("total_frames"), count("total_tasks"));
+    let (total_episodes, total_frames, total_tasks) =
+        (count("total_episodes"), count("total_frames"), count("total_tasks"));
     let chunks_size = count("chunks_size").filter(|n| *n > 0).unwrap_or(1000);
     let text_of = |key: &str| object.get(key).and_then(Value::as_str).map(str::to_owned);
     if text_of("data_path").is_none() {
-        defects.push(Defect::new(DefectKind::InfoKey, "meta/info.json data_path", "a path template", "nothing"));
+        defects.push(Defect::new(
+            DefectKind::InfoKey,
+            "meta/info.json data_path",
+            "a path template",
+            "nothing",
+        ));
     }
     let splits = object.get("splits").and_then(Value::as_object).into_iter().flatten();
     Ok(Info {
@@ -249,7 +290,9 @@ pub(super) fn read_info(root: &Path, limits: &ReadLimits, defects: &mut Vec<Defe
         total_frames,
         total_tasks,
         chunks_size,
-        splits: splits.map(|(k, v)| (k.clone(), v.as_str().map_or_else(|| v.to_string(), str::to_owned))).collect(),
+        splits: splits
+            .map(|(k, v)| (k.clone(), v.as_str().map_or_else(|| v.to_string(), str::to_owned)))
+            .collect(),
         data_path: text_of("data_path").unwrap_or_else(|| default_data_path.to_owned()),
         video_path: text_of("video_path"),
         features,
@@ -257,7 +300,12 @@ pub(super) fn read_info(root: &Path, limits: &ReadLimits, defects: &mut Vec<Defe
     })
 }
 
-fn feature_decl(name: &str, value: &Value, limits: &ReadLimits, defects: &mut Vec<Defect>) -> Option<FeatureDecl> {
+fn feature_decl(
+    name: &str,
+    value: &Value,
+    limits: &ReadLimits,
+    defects: &mut Vec<Defect>,
+) -> Option<FeatureDecl> {
     let place = format!("meta/info.json features.{name}");
     let mut bad = |expected: &str, got: String| {
         defects.push(Defect::new(DefectKind::BadFeature, place.clone(), expected, got));
@@ -276,12 +324,17 @@ fn feature_decl(name: &str, value: &Value, limits: &ReadLimits, defects: &mut Ve
         }
     };
     let shape: Option<Vec<usize>> = value.get("shape").and_then(Value::as_array).and_then(|dims| {
-        dims.iter().map(|d| d.as_u64().and_then(|d| usize::try_from(d).ok()).filter(|d| *d > 0 && *d <= 1 << 20)).collect()
+        dims.iter()
+            .map(|d| d.as_u64().and_then(|d| usize::try_from(d).ok()).filter(|d| *d > 0 && *d <= 1 << 20))
+            .collect()
     });
     let shape = match shape {
         Some(shape) if !shape.is_empty() && shape.len() <= 5 => shape,
         _ => {
-            bad("a shape of one to five positive sizes", value.get("shape").map_or("nothing".to_owned(), Value::to_string));
+            bad(
+                "a shape of one to five positive sizes",
+                value.get("shape").map_or("nothing".to_owned(), Value::to_string),
+            );
             return None;
         }
     };
@@ -308,7 +361,15 @@ fn feature_decl(name: &str, value: &Value, limits: &ReadLimits, defects: &mut Ve
     }
     let mut units = Vec::new();
     flatten_names(value.get("units").or_else(|| value.get("unit")).unwrap_or(&Value::Null), 0, &mut units);
-    Some(FeatureDecl { name: name.to_owned(), dtype, dtype_name, shape, names, units, has_names_key: value.get("names").is_some() })
+    Some(FeatureDecl {
+        name: name.to_owned(),
+        dtype,
+        dtype_name,
+        shape,
+        names,
+        units,
+        has_names_key: value.get("names").is_some(),
+    })
 }
 
 /// Collects texts from nested lists and objects (`names` is a list, a list of lists or an object of lists).

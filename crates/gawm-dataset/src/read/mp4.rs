@@ -152,7 +152,8 @@ fn walk(data: &[u8], depth: usize, draft: &mut Draft) {
         }
         b"stts" => {
             let n = (at_u32(body, 4) as usize).min(body.len().saturating_sub(8) / 8);
-            draft.track.durations = (0..n).map(|i| (at_u32(body, 8 + 8 * i), at_u32(body, 12 + 8 * i))).collect();
+            draft.track.durations =
+                (0..n).map(|i| (at_u32(body, 8 + 8 * i), at_u32(body, 12 + 8 * i))).collect();
         }
         b"stco" => {
             let n = (at_u32(body, 4) as usize).min(body.len().saturating_sub(8) / 4);
@@ -160,7 +161,8 @@ fn walk(data: &[u8], depth: usize, draft: &mut Draft) {
         }
         b"co64" => {
             let n = (at_u32(body, 4) as usize).min(body.len().saturating_sub(8) / 8);
-            let wide = |i: usize| u64::from(at_u32(body, 8 + 8 * i)) << 32 | u64::from(at_u32(body, 12 + 8 * i));
+            let wide =
+                |i: usize| u64::from(at_u32(body, 8 + 8 * i)) << 32 | u64::from(at_u32(body, 12 + 8 * i));
             draft.last_chunk = (0..n).map(wide).max().unwrap_or(0);
         }
         b"stsd" => {
@@ -177,7 +179,9 @@ fn for_each_box<'a>(data: &'a [u8], f: &mut dyn FnMut(&[u8], &'a [u8])) {
     let mut at = 0usize;
     while at + 8 <= data.len() {
         let length = at_u32(data, at) as usize;
-        let Some(end) = at.checked_add(length).filter(|end| length >= 8 && *end <= data.len()) else { return };
+        let Some(end) = at.checked_add(length).filter(|end| length >= 8 && *end <= data.len()) else {
+            return;
+        };
         f(&data[at + 4..at + 8], &data[at + 8..end]);
         at = end;
     }

@@ -19,7 +19,8 @@ pub(super) fn fill(template: &str, values: TemplateValues<'_>) -> Result<String,
     let mut rest = template;
     while let Some(open) = rest.find('{') {
         out.push_str(&rest[..open]);
-        let close = rest[open..].find('}').ok_or_else(|| format!("an unclosed brace in {template:?}"))? + open;
+        let close =
+            rest[open..].find('}').ok_or_else(|| format!("an unclosed brace in {template:?}"))? + open;
         let (name, format) = rest[open + 1..close].split_once(':').unwrap_or((&rest[open + 1..close], ""));
         let number = match name {
             "chunk_index" | "episode_chunk" => values.chunk,
@@ -34,7 +35,10 @@ pub(super) fn fill(template: &str, values: TemplateValues<'_>) -> Result<String,
         };
         let digits = match format {
             "" | "d" => 0,
-            f => f.trim_end_matches('d').parse::<usize>().map_err(|_| format!("the unknown format {f:?} in {template:?}"))?,
+            f => f
+                .trim_end_matches('d')
+                .parse::<usize>()
+                .map_err(|_| format!("the unknown format {f:?} in {template:?}"))?,
         };
         if digits > 20 {
             return Err(format!("a width of {digits} digits in {template:?}"));
@@ -70,7 +74,8 @@ mod tests {
     use super::*;
 
     fn check_fill(template: &str, expected: Result<&str, &str>) {
-        let values = TemplateValues { chunk: 1, file: 12, episode: 1234567, video_key: "observation.images.a" };
+        let values =
+            TemplateValues { chunk: 1, file: 12, episode: 1234567, video_key: "observation.images.a" };
         match (fill(template, values), expected) {
             (Ok(got), Ok(expected)) => assert_eq!(got, expected),
             (Err(got), Err(part)) => assert!(got.contains(part), "{got}"),
@@ -80,7 +85,10 @@ mod tests {
 
     #[test]
     fn templates_are_filled_or_refused() {
-        check_fill("data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet", Ok("data/chunk-001/file-012.parquet"));
+        check_fill(
+            "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+            Ok("data/chunk-001/file-012.parquet"),
+        );
         check_fill("d/{episode_chunk:03d}/e_{episode_index:06d}.parquet", Ok("d/001/e_1234567.parquet"));
         check_fill("v/{video_key}/{file_index}.mp4", Ok("v/observation.images.a/12.mp4"));
         check_fill("x/{file_index:999d}", Err("999 digits"));

@@ -121,8 +121,12 @@ impl Dataset {
                     });
                     if let Err(got) = outcome {
                         let place = &self.files[unit.file].relative;
-                        let defect = Defect::new(DefectKind::UnreadableFile, place, "readable column data", got);
-                        defects.lock().unwrap_or_else(std::sync::PoisonError::into_inner).push((unit_index, defect));
+                        let defect =
+                            Defect::new(DefectKind::UnreadableFile, place, "readable column data", got);
+                        defects
+                            .lock()
+                            .unwrap_or_else(std::sync::PoisonError::into_inner)
+                            .push((unit_index, defect));
                     }
                 });
             }
@@ -180,7 +184,12 @@ impl Dataset {
         names.iter().filter(exists).map(column).collect()
     }
 
-    fn read_unit(&self, unit: &Unit, names: &[String], mut emit: impl FnMut(EpisodeRows)) -> Result<(), String> {
+    fn read_unit(
+        &self,
+        unit: &Unit,
+        names: &[String],
+        mut emit: impl FnMut(EpisodeRows),
+    ) -> Result<(), String> {
         let empty = self.empty_columns(unit.file, names);
         let mut current = empty.clone();
         let mut runs = unit.runs.clone();
@@ -224,7 +233,10 @@ impl Dataset {
         let schema = builder.schema().clone();
         let roots = columns.iter().filter_map(|name| schema.index_of(name).ok());
         let mask = ProjectionMask::roots(builder.parquet_schema(), roots);
-        let builder = builder.with_projection(mask).with_row_groups(unit.row_groups.clone()).with_batch_size(batch_rows);
+        let builder = builder
+            .with_projection(mask)
+            .with_row_groups(unit.row_groups.clone())
+            .with_batch_size(batch_rows);
         builder.build().map_err(|e| e.to_string())
     }
 }
