@@ -7,8 +7,21 @@
 //! **Invariant**: this crate knows neither files nor tensors.
 #![forbid(unsafe_code)]
 
+mod encoding;
 mod feature;
+mod hash;
 mod kind;
+pub mod rotation;
+mod standardise;
+mod statistics;
+mod unit;
+mod validate;
 
+pub use encoding::{EncodeError, EncodedDim, Encoder, Encoding};
 pub use feature::{Dim, Feature, FeatureData, FloatType, ImageSpec, Part, Role, Schema, StreamInfo};
+pub use hash::{ContentHash, canonical_json};
 pub use kind::{EulerSequence, Kind, QuaternionOrder, Unit, Wrap};
+pub use standardise::{FittedOn, Standardisation, StandardisedDim, is_training, training_fraction};
+pub use statistics::{Circular, DimStats, DimSummary, Histogram, Moments, QuantileSketch};
+pub use unit::UnitConversion;
+pub use validate::{SchemaError, first_difference};
