@@ -13,6 +13,7 @@ mod error;
 mod image_header;
 mod journal;
 pub mod layout;
+mod picture;
 mod provenance;
 pub mod read;
 mod rows;

@@ -185,4 +185,14 @@ impl Dataset {
             .filter(|e| e.episode_index == episode_index)
             .or_else(|| self.episodes.iter().find(|e| e.episode_index == episode_index))
     }
+
+    /// Returns the path of an episode's video relative to the folder, or what is wrong with it; `None` without videos.
+    pub fn video_path(&self, entry: &EpisodeEntry, camera: &str) -> Option<Result<String, String>> {
+        let template = self.info.video_path.as_deref()?;
+        let span = entry.videos.get(camera)?;
+        let episode = u64::try_from(entry.episode_index).unwrap_or(0);
+        let values = paths::TemplateValues { chunk: span.chunk, file: span.file, episode, video_key: camera };
+        let path = paths::fill(template, values);
+        Some(path.and_then(|path| paths::join_inside(&self.root, &path).map(|_| path)))
+    }
 }

@@ -5,8 +5,10 @@
 //! their own. Codes are in [`RULES`], bounds in [`Thresholds`].
 
 mod catalogue;
+mod demo;
 mod finding;
 mod group;
+mod image;
 mod layout;
 mod profile;
 mod render;
@@ -25,6 +27,7 @@ mod windows;
 use std::collections::BTreeMap;
 
 pub use catalogue::{RULES, Rule, rule};
+pub use demo::{DemoError, DemoReport, DemoRule, run_demo};
 pub use finding::{Counts, Finding, Report, Severity};
 pub use render::{render_markdown, render_text};
 pub use thresholds::{
@@ -74,6 +77,14 @@ pub fn validate(dataset: &Dataset, options: &ValidateOptions) -> Result<Report, 
     findings.extend(value::judge(&plan, thresholds, dataset.info.fps, &runs));
     findings.extend(semantic::judge(dataset, &plan, thresholds, &runs));
     findings.extend(split::judge(dataset, &plan, thresholds, &runs));
+    if has_images {
+        let (found, defects) = image::judge(dataset, thresholds, &runs, |_| {});
+        findings.extend(found);
+        findings.extend(structure::judge_defects(dataset, &defects));
+    }
+    if options.checks_images {
+        findings.extend(image::judge_videos(dataset));
+    }
     let windows = window_yield(dataset, options, &runs, &mut findings);
     Ok(report(dataset, thresholds, windows, findings))
 }

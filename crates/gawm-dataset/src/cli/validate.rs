@@ -6,7 +6,7 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 
 use super::{EXIT_CHECK_FAILED, Failure, open, print_result};
-use crate::validate::{Severity, Thresholds, ValidateOptions, render_markdown, render_text, validate};
+use crate::validate::{DemoReport, Severity, Thresholds, ValidateOptions, render_markdown, render_text, run_demo, validate};
 
 /// Check a dataset and say what harms training
 ///
@@ -30,6 +30,9 @@ pub(super) struct ValidateArguments {
     /// Do not look at pictures
     #[arg(long)]
     no_images: bool,
+    /// Plant defects in clean synthetic data, one at a time, and report which are found
+    #[arg(long)]
+    demo: bool,
     /// Print all thresholds as TOML and stop
     #[arg(long)]
     print_rules: bool,
@@ -67,6 +70,9 @@ pub(super) fn run(arguments: &ValidateArguments, quiet: bool) -> Result<u8, Fail
         print_result(&toml::to_string(&thresholds)?)?;
         return Ok(0);
     }
+    if arguments.demo {
+        return run_self_test(arguments.format);
+    }
     let Some(dir) = &arguments.dir else {
         return Err(Failure::usage(anyhow::anyhow!("expected a dataset folder, got none")));
     };
@@ -93,4 +99,26 @@ pub(super) fn run(arguments: &ValidateArguments, quiet: bool) -> Result<u8, Fail
         FailOn::Never => return Ok(0),
     };
     Ok(if report.findings.iter().any(|f| f.severity >= bound) { EXIT_CHECK_FAILED } else { 0 })
+}
+
+/// Runs the self-test: exit code 0 only if all defects at full strength were found and nothing on clean data.
+fn run_self_test(format: Format) -> Result<u8, Failure> {
+    let report = run_demo()?;
+    let text = if format == Format::Json { serde_json::to_string_pretty(&report)? + "\n" } else { demo_table(&report) };
+    print_result(&text)?;
+    Ok(if report.is_perfect() { 0 } else { EXIT_CHECK_FAILED })
+}
+
+fn demo_table(report: &DemoReport) -> String {
+    let mut out = format!("{:<34} {:<14} found at strength 0.3, 0.6, 1.0\n", "defect", "rule");
+    for rule in &report.rules {
+        let marks = rule.found.map(|f| if f { "yes" } else { "no" }).join(" ");
+        out += &format!("{:<34} {:<14} {marks}\n", rule.defect, rule.code);
+    }
+    out += &format!(
+        "\n{} of {} planted defects found, {} of {} at full strength; {} false alarms on {} clean datasets\n",
+        report.found, report.planted, report.found_at_full_strength, report.planted_at_full_strength, report.false_alarms, report.clean_twins
+    );
+    report.false_alarm_texts.iter().for_each(|text| out += &format!("false alarm: {text}\n"));
+    out
 }

@@ -75,17 +75,10 @@ impl Dataset {
             }
             results
         };
-        let results: Vec<Vec<(usize, F::Output)>> = self.frame_units().par_iter().map(read).collect();
+        let results: Vec<Vec<(usize, F::Output)>> = self.units(1).par_iter().map(read).collect();
         let mut defects = defects.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
         defects.sort_by_key(|(run, _)| *run);
         (results.into_iter().flatten().collect(), defects.into_iter().map(|(_, d)| d).collect())
-    }
-
-    fn frame_units(&self) -> Vec<Unit> {
-        let mut units = self.units();
-        // Small datasets still use all threads: nothing else bounds the size of a unit of frames.
-        units.sort_by_key(|unit| unit.runs.start);
-        units
     }
 
     fn read_frames_of_unit<F: FrameReader>(

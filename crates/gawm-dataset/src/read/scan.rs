@@ -92,7 +92,7 @@ impl Dataset {
                 return Err(ScanError::EpisodeTooLong { episode, max: self.limits.max_unit_rows, got });
             }
         }
-        let units = self.units();
+        let units = self.units(UNIT_ROWS);
         let results: Mutex<Vec<(usize, R)>> = Mutex::new(Vec::with_capacity(self.runs.len()));
         let defects: Mutex<Vec<(usize, Defect)>> = Mutex::new(Vec::new());
         let n_threads = rayon::current_num_threads();
@@ -138,8 +138,8 @@ impl Dataset {
         Ok((results.into_iter().map(|(_, r)| r).collect(), defects.into_iter().map(|(_, d)| d).collect()))
     }
 
-    /// Cuts the files into units that end where a row group and a run end together.
-    pub(super) fn units(&self) -> Vec<Unit> {
+    /// Cuts the files into units of at least `min_rows` that end where a row group and a run end together.
+    pub(super) fn units(&self, min_rows: u64) -> Vec<Unit> {
         let mut units = Vec::new();
         let mut run = 0;
         for (file_index, file) in self.files.iter().enumerate() {
@@ -154,7 +154,7 @@ impl Dataset {
                     run += 1;
                 }
                 let is_last = group + 1 == file.row_groups.len();
-                if is_last || (run_end == group_end && unit_rows >= UNIT_ROWS) {
+                if is_last || (run_end == group_end && unit_rows >= min_rows) {
                     unit.runs.end = run;
                     let next = Unit { file: file_index, row_groups: Vec::new(), runs: run..run };
                     units.push(std::mem::replace(&mut unit, next));

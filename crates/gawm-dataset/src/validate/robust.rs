@@ -72,19 +72,6 @@ impl Pair {
         }
     }
 
-    pub(super) fn merge(&mut self, other: &Pair) {
-        self.n += other.n;
-        self.x += other.x;
-        self.y += other.y;
-        self.xx += other.xx;
-        self.yy += other.yy;
-        self.xy += other.xy;
-    }
-
-    pub(super) fn n(&self) -> f64 {
-        self.n
-    }
-
     fn moments(&self) -> (f64, f64, f64) {
         let (vx, vy) = (self.xx - self.x * self.x / self.n, self.yy - self.y * self.y / self.n);
         (vx.max(0.0), vy.max(0.0), self.xy - self.x * self.y / self.n)

@@ -1,6 +1,6 @@
 //! One dim of one run, measured: range, steps, unsteadiness, rests, plateaus, wraps.
 
-use std::f64::consts::{PI, TAU};
+use std::f64::consts::TAU;
 
 use super::{
     layout::DimKind,
@@ -163,9 +163,18 @@ fn unwrapped_steps(values: &[f64], kind: DimKind, signal: &mut Signal) -> Vec<f6
     };
     signal.wrap_period = period;
     let mut steps = Vec::with_capacity(values.len() - 1);
+    let is_wrap = |row: usize, step: f64| {
+        // Without the turn, the step must continue the motion on one of its sides.
+        let rest = step - period * step.signum();
+        let beside = |other: Option<usize>| {
+            let pair = other.and_then(|row| Some(values.get(row + 1)? - values.get(row)?));
+            pair.is_some_and(|beside| (rest - beside).abs() < 0.02 * period)
+        };
+        beside(row.checked_sub(1)) || beside(Some(row + 1))
+    };
     for (row, pair) in values.windows(2).enumerate() {
         let mut step = pair[1] - pair[0];
-        if period > 0.0 && (step.abs() - period).abs() < 0.1 * period {
+        if period > 0.0 && (step.abs() - period).abs() < 0.1 * period && is_wrap(row, step) {
             step -= period * step.signum();
             signal.n_wraps += 1;
             signal.first_wrap.get_or_insert(row + 1);
@@ -234,7 +243,7 @@ fn keep_largest(jumps: &mut Vec<Jump>) {
 
 fn rests(steps: &[f64], signal: &mut Signal) {
     let mut current = Stretch { start: 0, n_rows: 1 };
-    let mut end = |rest: Stretch, signal: &mut Signal| {
+    let end = |rest: Stretch, signal: &mut Signal| {
         if rest.n_rows > signal.longest_rest.n_rows {
             signal.second_rest = signal.longest_rest.n_rows;
             signal.longest_rest = rest;
@@ -319,14 +328,13 @@ fn zero_drops(values: &[f64], signal: &mut Signal) {
     }
 }
 
-/// Returns the angle `value` in [-pi, pi).
-pub(super) fn wrapped(value: f64) -> f64 {
-    (value + PI).rem_euclid(TAU) - PI
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn wrapped(value: f64) -> f64 {
+        (value + TAU / 2.0).rem_euclid(TAU) - TAU / 2.0
+    }
 
     fn smooth(n: usize) -> Vec<f64> {
         (0..n).map(|t| (t as f64 * 0.05).sin() + 0.3 * (t as f64 * 0.023).cos()).collect()

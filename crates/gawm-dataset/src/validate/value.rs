@@ -13,6 +13,11 @@ use super::{
 
 /// Fewest runs whose comparison says something about one of them.
 const MIN_RUNS: usize = 4;
+/// Share of the largest range among dims of one unit below which a dim is at rest.
+const IDLE_SHARE: f64 = 0.05;
+/// Rows at the begin of an episode in which controllers settle: only large jumps count there.
+const SETTLING_ROWS: usize = 8;
+
 /// Share of runs in which a group of dims must keep its constraint to be recognised.
 const RECOGNISED_RUNS: f64 = 0.6;
 
@@ -69,6 +74,14 @@ impl Judge<'_> {
         median(&values)
     }
 
+    /// Returns whether the dim hardly moves beside others of its unit: what it shows is the noise of a joint at rest.
+    fn is_idle(&self, dim: usize) -> bool {
+        let layout = &self.plan.layouts[self.feature];
+        let peers = (0..layout.width()).filter(|d| layout.units[*d] == layout.units[dim]);
+        let largest = peers.map(|d| self.typical(d, Signal::range)).filter(|r| r.is_finite()).fold(0.0, f64::max);
+        self.typical(dim, Signal::range) < IDLE_SHARE * largest
+    }
+
     fn dim(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
         let moving = self.signals(dim).filter(|(_, s)| s.n_finite > 1 && !s.is_constant()).count();
         if moving == 0 {
@@ -77,8 +90,10 @@ impl Judge<'_> {
             self.constant_here(dim, moving, findings);
             self.stuck(dim, kind, findings);
             self.saturated(dim, kind, findings);
-            self.jumps(dim, kind, findings);
-            self.noise(dim, kind, findings);
+            if !self.is_idle(dim) {
+                self.jumps(dim, kind, findings);
+                self.noise(dim, kind, findings);
+            }
             self.wraps(dim, kind, findings);
             self.offset(dim, kind, findings);
         }
@@ -228,7 +243,7 @@ impl Judge<'_> {
         let n_jumping = counts.iter().filter(|c| **c > 0).count();
         // A signal that jumps everywhere is made of steps: set points, not measurements.
         let is_stepping = counts.iter().sum::<usize>() as f64 > 0.005 * n_rows as f64
-            || (counts.len() >= MIN_RUNS && n_jumping as f64 > 0.5 * counts.len() as f64);
+            || (counts.len() >= MIN_RUNS && n_jumping * 2 > counts.len() && counts.iter().sum::<usize>() > 3 * counts.len());
         if is_stepping {
             return;
         }
@@ -240,6 +255,7 @@ impl Judge<'_> {
                 .jumps
                 .iter()
                 .filter(|j| j.size > floor && !signal.zero_drops.contains(&j.row))
+                .filter(|j| j.row > SETTLING_ROWS || j.size > 0.5 * range)
                 .collect();
             jumps.sort_by_key(|j| j.row);
             let Some(first) = jumps.first() else { continue };
@@ -297,7 +313,9 @@ impl Judge<'_> {
     }
 
     fn wraps(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
-        if matches!(kind, DimKind::Wrapped { .. } | DimKind::Rotation | DimKind::Bool | DimKind::Gripper) {
+        if matches!(kind, DimKind::Wrapped { .. } | DimKind::Rotation | DimKind::Bool | DimKind::Gripper)
+            || self.typical(dim, |s| s.rest_share) > 0.9
+        {
             return;
         }
         for (run, signal) in self.signals(dim) {
