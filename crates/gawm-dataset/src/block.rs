@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use arrow::array::{
-    Array, ArrayRef, BinaryArray, BinaryBuilder, BooleanArray, Float32Array, Float64Array, Int64Array, ListArray,
-    RecordBatch, StringArray, StructArray,
+    Array, ArrayRef, BinaryArray, BinaryBuilder, BooleanArray, Float32Array, Float64Array, Int64Array,
+    ListArray, RecordBatch, StringArray, StructArray,
 };
 use arrow::buffer::{OffsetBuffer, ScalarBuffer};
 use arrow::datatypes::DataType;
@@ -161,7 +161,11 @@ impl RowBlock {
     }
 
     /// Returns the rows as Arrow columns.
-    pub(crate) fn to_arrow(&self, columns: &Columns, position: BlockPosition) -> Result<RecordBatch, ArrowError> {
+    pub(crate) fn to_arrow(
+        &self,
+        columns: &Columns,
+        position: BlockPosition,
+    ) -> Result<RecordBatch, ArrowError> {
         let n_rows = self.len() as i64;
         let frames = position.first_frame..position.first_frame + n_rows;
         let fps = f64::from(columns.fps);

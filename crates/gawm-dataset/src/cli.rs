@@ -1,5 +1,6 @@
 //! The command line of `gawm-data`.
 
+mod stats;
 mod validate;
 
 use std::process::ExitCode;
@@ -26,6 +27,7 @@ pub struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Verb {
     Validate(validate::ValidateArguments),
+    Stats(stats::StatsArguments),
 }
 
 /// Runs the program and returns its exit code.
@@ -45,6 +47,7 @@ pub fn run(arguments: impl IntoIterator<Item = std::ffi::OsString>) -> ExitCode 
     }
     let outcome = match &arguments.verb {
         Verb::Validate(verb) => validate::run(verb, arguments.quiet),
+        Verb::Stats(verb) => stats::run(verb),
     };
     match outcome {
         Ok(code) => ExitCode::from(code),
@@ -108,4 +111,15 @@ pub(crate) fn open(dir: &std::path::Path) -> Result<crate::read::Dataset, Failur
         };
         Failure::from(e).hint(hint)
     })
+}
+
+/// Replaces a file as a whole: written beside it, synced, renamed.
+pub(crate) fn write_replacing(path: &std::path::Path, bytes: &[u8]) -> std::io::Result<()> {
+    use std::io::Write;
+    let folder = path.parent().unwrap_or_else(|| std::path::Path::new("."));
+    let mut file = tempfile::NamedTempFile::new_in(folder)?;
+    file.write_all(bytes)?;
+    file.as_file().sync_all()?;
+    file.persist(path)?;
+    Ok(())
 }

@@ -74,7 +74,8 @@ impl Columns {
                 Some(EncodedPlan { name, encoder, inputs })
             })
             .collect();
-        let valid_names = vectors.iter().map(|v| &v.name).chain(images.iter().map(|i| &i.name)).cloned().collect();
+        let valid_names =
+            vectors.iter().map(|v| &v.name).chain(images.iter().map(|i| &i.name)).cloned().collect();
         let mut columns = Columns {
             vectors,
             images,
@@ -97,14 +98,18 @@ impl Columns {
             Field::new("task_index", DataType::Int64, false),
         ];
         fields.extend(self.vectors.iter().map(|v| vector_field(&v.name, float_type(v.dtype), v.width())));
-        fields.extend(self.encoded.iter().map(|e| vector_field(e.name, DataType::Float32, e.encoder.width())));
+        fields
+            .extend(self.encoded.iter().map(|e| vector_field(e.name, DataType::Float32, e.encoder.width())));
         fields.push(Field::new(TIME_NS, DataType::Int64, false));
-        fields.extend(self.valid_names.iter().map(|n| Field::new(format!("{VALID}{n}"), DataType::Boolean, false)));
+        fields.extend(
+            self.valid_names.iter().map(|n| Field::new(format!("{VALID}{n}"), DataType::Boolean, false)),
+        );
         if self.n_streams > 0 {
             fields.push(vector_field(AGE_MS, DataType::Float32, self.n_streams));
             fields.push(vector_field(ARRIVAL_AGE_MS, DataType::Float32, self.n_streams));
         }
-        fields.extend(self.images.iter().map(|i| Field::new(&i.name, DataType::Struct(image_fields()), true)));
+        fields
+            .extend(self.images.iter().map(|i| Field::new(&i.name, DataType::Struct(image_fields()), true)));
         ArrowSchema::new_with_metadata(fields, self.arrow_metadata())
     }
 

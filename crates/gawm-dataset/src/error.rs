@@ -103,7 +103,9 @@ pub enum WriteError {
         id: String,
     },
     /// A piece of an episode does not continue the one before.
-    #[error("time does not increase in episode {id:?} at frame {frame}: expected more than {previous_ns} ns, got {time_ns} ns")]
+    #[error(
+        "time does not increase in episode {id:?} at frame {frame}: expected more than {previous_ns} ns, got {time_ns} ns"
+    )]
     Time {
         /// The episode.
         id: String,
@@ -115,7 +117,9 @@ pub enum WriteError {
         time_ns: i64,
     },
     /// Numbers in an action that is not valid, before the last row.
-    #[error("{feature:?} holds numbers at frame {frame} of episode {id:?} though it is not valid, expected NaN before the last row")]
+    #[error(
+        "{feature:?} holds numbers at frame {frame} of episode {id:?} though it is not valid, expected NaN before the last row"
+    )]
     HeldActionInside {
         /// The episode.
         id: String,
@@ -163,7 +167,11 @@ impl WriteError {
     pub(crate) fn parquet(path: &Path) -> impl FnOnce(ParquetError) -> WriteError {
         let path = path.to_owned();
         move |source| {
-            if is_disk_full(&source) { WriteError::DiskFull { path } } else { WriteError::Parquet { path, source } }
+            if is_disk_full(&source) {
+                WriteError::DiskFull { path }
+            } else {
+                WriteError::Parquet { path, source }
+            }
         }
     }
 
@@ -171,14 +179,14 @@ impl WriteError {
     pub fn hint(&self) -> Option<&'static str> {
         match self {
             WriteError::DiskFull { .. } => Some("free some space, then run again with --resume"),
-            WriteError::NotEmpty { .. } => {
-                Some("--resume goes on with an interrupted run, --append adds to a finished dataset; or give another folder")
-            }
+            WriteError::NotEmpty { .. } => Some(
+                "--resume goes on with an interrupted run, --append adds to a finished dataset; or give another folder",
+            ),
             WriteError::NoDataset { .. } => Some("run without --append to make a new dataset"),
             WriteError::Unfinished { .. } => Some("run again with --resume to finish it first"),
-            WriteError::SpecChanged { .. } => {
-                Some("use the configuration that the dataset was made with (it is in meta/gawm.json), or another folder")
-            }
+            WriteError::SpecChanged { .. } => Some(
+                "use the configuration that the dataset was made with (it is in meta/gawm.json), or another folder",
+            ),
             _ => None,
         }
     }

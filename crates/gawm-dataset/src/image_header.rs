@@ -67,7 +67,11 @@ pub fn image_header(bytes: &[u8]) -> Result<ImageHeader, ImageHeaderError> {
     }
 }
 
-fn array<const N: usize>(bytes: &[u8], offset: usize, format: ImageFormat) -> Result<[u8; N], ImageHeaderError> {
+fn array<const N: usize>(
+    bytes: &[u8],
+    offset: usize,
+    format: ImageFormat,
+) -> Result<[u8; N], ImageHeaderError> {
     offset
         .checked_add(N)
         .and_then(|end| bytes.get(offset..end))
@@ -128,7 +132,11 @@ fn png(bytes: &[u8]) -> Result<ImageHeader, ImageHeaderError> {
     Ok(ImageHeader { format, height, width, channels })
 }
 
-fn tiff(bytes: &[u8], u16_of: fn([u8; 2]) -> u16, u32_of: fn([u8; 4]) -> u32) -> Result<ImageHeader, ImageHeaderError> {
+fn tiff(
+    bytes: &[u8],
+    u16_of: fn([u8; 2]) -> u16,
+    u32_of: fn([u8; 4]) -> u32,
+) -> Result<ImageHeader, ImageHeaderError> {
     let format = ImageFormat::Tiff;
     let start = u32_of(array(bytes, 4, format)?) as usize;
     let count = u16_of(array(bytes, start, format)?);
@@ -160,16 +168,16 @@ mod tests {
 
     /// A PNG header of 3x2 RGB.
     const PNG: [u8; 29] = [
-        0x89, b'P', b'N', b'G', 0x0d, 0x0a, 0x1a, 0x0a, 0, 0, 0, 13, b'I', b'H', b'D', b'R', 0, 0, 0, 3, 0, 0, 0,
-        2, 8, 2, 0, 0, 0,
+        0x89, b'P', b'N', b'G', 0x0d, 0x0a, 0x1a, 0x0a, 0, 0, 0, 13, b'I', b'H', b'D', b'R', 0, 0, 0, 3, 0,
+        0, 0, 2, 8, 2, 0, 0, 0,
     ];
     /// A JPEG with an APP0 segment, a fill byte and a SOF2 of 5 rows, 4 columns, 1 channel.
-    const JPEG: [u8; 21] = [
-        0xff, 0xd8, 0xff, 0xe0, 0, 4, 1, 2, 0xff, 0xff, 0xc2, 0, 11, 8, 0, 5, 0, 4, 1, 0, 0,
-    ];
+    const JPEG: [u8; 21] =
+        [0xff, 0xd8, 0xff, 0xe0, 0, 4, 1, 2, 0xff, 0xff, 0xc2, 0, 11, 8, 0, 5, 0, 4, 1, 0, 0];
     /// A TIFF with width 7 (short) and height 6 (long), little-endian.
     const TIFF: [u8; 34] = [
-        b'I', b'I', 42, 0, 8, 0, 0, 0, 2, 0, 0, 1, 3, 0, 1, 0, 0, 0, 7, 0, 0, 0, 1, 1, 4, 0, 1, 0, 0, 0, 6, 0, 0, 0,
+        b'I', b'I', 42, 0, 8, 0, 0, 0, 2, 0, 0, 1, 3, 0, 1, 0, 0, 0, 7, 0, 0, 0, 1, 1, 4, 0, 1, 0, 0, 0, 6,
+        0, 0, 0,
     ];
 
     fn check_header(bytes: &[u8], format: ImageFormat, height: u32, width: u32, channels: u32) {

@@ -72,7 +72,10 @@ impl Journal {
     }
 
     /// Opens an unfinished run: the journal, how it began, and its recordings in order.
-    pub(crate) fn open(dir: &Path, disk: &Disk) -> Result<(Journal, RunRecord, Vec<DoneRecording>), WriteError> {
+    pub(crate) fn open(
+        dir: &Path,
+        disk: &Disk,
+    ) -> Result<(Journal, RunRecord, Vec<DoneRecording>), WriteError> {
         let folder = dir.join(JOURNAL);
         let run: RunRecord = load(&folder.join("run.json"))?;
         let mut done = Vec::new();

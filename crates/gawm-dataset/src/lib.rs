@@ -20,6 +20,7 @@ mod rows;
 mod scan;
 mod spec;
 mod statistics_file;
+pub mod stats;
 mod tables;
 mod totals;
 mod trajectory;

@@ -58,11 +58,16 @@ fn decode_jpeg(bytes: &[u8], min_side: usize) -> Result<Picture, PictureError> {
     let header = decompressor.read_header(bytes).map_err(damaged)?;
     let factors = [ScalingFactor::ONE_EIGHTH, ScalingFactor::ONE_QUARTER, ScalingFactor::ONE_HALF];
     let is_enough = |f: &ScalingFactor| f.scale(header.width).min(f.scale(header.height)) >= min_side;
-    let factor = if header.is_lossless { ScalingFactor::ONE } else { factors.into_iter().find(is_enough).unwrap_or(ScalingFactor::ONE) };
+    let factor = if header.is_lossless {
+        ScalingFactor::ONE
+    } else {
+        factors.into_iter().find(is_enough).unwrap_or(ScalingFactor::ONE)
+    };
     decompressor.set_scaling_factor(factor).map_err(damaged)?;
     let (width, height) = (factor.scale(header.width), factor.scale(header.height));
     let mut rgb = vec![0; width * height * 3];
-    let image = Image { pixels: rgb.as_mut_slice(), width, pitch: width * 3, height, format: PixelFormat::RGB };
+    let image =
+        Image { pixels: rgb.as_mut_slice(), width, pitch: width * 3, height, format: PixelFormat::RGB };
     decompressor.decompress(bytes, image).map_err(damaged)?;
     Ok(Picture { width, height, rgb })
 }

@@ -4,7 +4,9 @@ use std::fs::File;
 use std::path::Path;
 use std::sync::Arc;
 
-use arrow::array::{Array, ArrayRef, BooleanArray, Float32Array, Float64Array, Int64Array, ListArray, RecordBatch};
+use arrow::array::{
+    Array, ArrayRef, BooleanArray, Float32Array, Float64Array, Int64Array, ListArray, RecordBatch,
+};
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
@@ -62,7 +64,8 @@ impl Scan<'_> {
         }
         let images: Vec<&str> = self.columns.images.iter().map(|image| image.name.as_str()).collect();
         let schema = builder.schema().clone();
-        let wanted = (0..schema.fields().len()).filter(|&i| !images.contains(&schema.field(i).name().as_str()));
+        let wanted =
+            (0..schema.fields().len()).filter(|&i| !images.contains(&schema.field(i).name().as_str()));
         let mask = ProjectionMask::roots(builder.parquet_schema(), wanted);
         let reader = builder
             .with_projection(mask)
@@ -146,7 +149,8 @@ pub(crate) fn vector_values(batch: &RecordBatch, name: &str, width: usize) -> Re
         return Ok(StoredValues::F32(values.values().to_vec()));
     }
     let values = items.as_any().downcast_ref::<Float64Array>();
-    let values = values.ok_or_else(|| format!("column {name:?} holds {}, expected floats", items.data_type()))?;
+    let values =
+        values.ok_or_else(|| format!("column {name:?} holds {}, expected floats", items.data_type()))?;
     Ok(StoredValues::F64(values.values().to_vec()))
 }
 

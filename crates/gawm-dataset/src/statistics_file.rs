@@ -40,7 +40,11 @@ pub struct DimStatistics {
 
 impl StatisticsFile {
     /// Collects the statistics of a dataset.
-    pub(crate) fn new(columns: &Columns, totals: &Totals, cameras: &BTreeMap<String, CameraStats>) -> StatisticsFile {
+    pub(crate) fn new(
+        columns: &Columns,
+        totals: &Totals,
+        cameras: &BTreeMap<String, CameraStats>,
+    ) -> StatisticsFile {
         let names = column_dims(columns);
         let by_column = names
             .into_iter()
@@ -57,9 +61,10 @@ impl StatisticsFile {
 /// Returns name and dim names of each column with statistics, in the order of [`Totals::dims`].
 fn column_dims(columns: &Columns) -> Vec<(String, Vec<String>)> {
     let vectors = columns.vectors.iter().map(|v| (v.name.clone(), v.dim_names.clone()));
-    let encoded = columns.encoded.iter().map(|e| {
-        (e.name.to_owned(), e.encoder.dims().iter().map(|dim| dim.name.clone()).collect())
-    });
+    let encoded = columns
+        .encoded
+        .iter()
+        .map(|e| (e.name.to_owned(), e.encoder.dims().iter().map(|dim| dim.name.clone()).collect()));
     vectors.chain(encoded).collect()
 }
 
@@ -74,7 +79,11 @@ fn dim_statistics(name: String, stats: &DimStats) -> DimStatistics {
 }
 
 /// Returns LeRobot's `meta/stats.json`.
-pub(crate) fn lerobot_stats(columns: &Columns, totals: &Totals, cameras: &BTreeMap<String, CameraStats>) -> Value {
+pub(crate) fn lerobot_stats(
+    columns: &Columns,
+    totals: &Totals,
+    cameras: &BTreeMap<String, CameraStats>,
+) -> Value {
     let mut features = serde_json::Map::new();
     for ((name, _), dims) in column_dims(columns).into_iter().zip(&totals.dims) {
         let summaries: Vec<DimSummary> = dims.iter().map(DimStats::summary).collect();

@@ -41,10 +41,8 @@ pub(crate) fn episodes_table(episodes: &[EpisodeRecord], cameras: &[&str]) -> Re
     for feature in features {
         push_stats(&mut columns, episodes, feature, cameras.contains(&feature.as_str()));
     }
-    let fields: Vec<Field> = columns
-        .iter()
-        .map(|(name, array)| Field::new(name, array.data_type().clone(), false))
-        .collect();
+    let fields: Vec<Field> =
+        columns.iter().map(|(name, array)| Field::new(name, array.data_type().clone(), false)).collect();
     let arrays = columns.into_iter().map(|(_, array)| array).collect();
     let schema = Arc::new(ArrowSchema::new(fields));
     to_parquet(Path::new(crate::layout::EPISODES), RecordBatch::try_new(schema, arrays))
@@ -60,7 +58,12 @@ fn plain_columns(episodes: &[EpisodeRecord]) -> Vec<(String, ArrayRef)> {
     push("episode_index", int_array(0..episodes.len() as i64));
     push("tasks", {
         let items = Arc::new(StringArray::from_iter_values(episodes.iter().map(|e| &e.task)));
-        Arc::new(ListArray::new(item_field(DataType::Utf8), OffsetBuffer::from_repeated_length(1, episodes.len()), items, None))
+        Arc::new(ListArray::new(
+            item_field(DataType::Utf8),
+            OffsetBuffer::from_repeated_length(1, episodes.len()),
+            items,
+            None,
+        ))
     });
     push("length", ints(|e| e.length as i64));
     push("data/chunk_index", ints(|e| file_position(e.file).0 as i64));
@@ -89,13 +92,20 @@ fn plain_columns(episodes: &[EpisodeRecord]) -> Vec<(String, ArrayRef)> {
     columns
 }
 
-fn push_stats(columns: &mut Vec<(String, ArrayRef)>, episodes: &[EpisodeRecord], feature: &str, is_camera: bool) {
+fn push_stats(
+    columns: &mut Vec<(String, ArrayRef)>,
+    episodes: &[EpisodeRecord],
+    feature: &str,
+    is_camera: bool,
+) {
     let default = FeatureStats::default();
-    let stats: Vec<&FeatureStats> = episodes.iter().map(|e| e.stats.get(feature).unwrap_or(&default)).collect();
+    let stats: Vec<&FeatureStats> =
+        episodes.iter().map(|e| e.stats.get(feature).unwrap_or(&default)).collect();
     let names = default.named().map(|(name, _)| name);
     for (position, name) in names.into_iter().enumerate() {
         let values: Vec<&[f64]> = stats.iter().map(|s| s.named()[position].1).collect();
-        let items: ArrayRef = Arc::new(Float64Array::from_iter_values(values.iter().flat_map(|v| v.iter().copied())));
+        let items: ArrayRef =
+            Arc::new(Float64Array::from_iter_values(values.iter().flat_map(|v| v.iter().copied())));
         let lengths = values.iter().map(|v| v.len());
         let array = if is_camera {
             // Shape (3, 1, 1): each value in two lists of one.
@@ -122,7 +132,8 @@ fn to_parquet(path: &Path, batch: Result<RecordBatch, ArrowError>) -> Result<Vec
     let mut bytes = Vec::new();
     let write = || {
         let batch = batch?;
-        let mut writer = ArrowWriter::try_new(&mut bytes, batch.schema(), Some(numeric_properties().build()))?;
+        let mut writer =
+            ArrowWriter::try_new(&mut bytes, batch.schema(), Some(numeric_properties().build()))?;
         writer.write(&batch)?;
         writer.close()
     };
@@ -208,8 +219,9 @@ impl TableBatch<'_> {
 
     fn count(&self, name: &str, row: usize) -> Result<u64, WriteError> {
         let value = self.int(name, row)?;
-        u64::try_from(value)
-            .map_err(|_negative| damaged(self.path, format!("{name:?} is {value} in row {row}, expected 0 or more")))
+        u64::try_from(value).map_err(|_negative| {
+            damaged(self.path, format!("{name:?} is {value} in row {row}, expected 0 or more"))
+        })
     }
 
     fn bool(&self, name: &str, row: usize) -> Result<bool, WriteError> {
@@ -252,11 +264,13 @@ impl TableBatch<'_> {
     fn stats(&self, row: usize) -> Result<BTreeMap<String, FeatureStats>, WriteError> {
         let mut stats: BTreeMap<String, FeatureStats> = BTreeMap::new();
         for field in self.batch.schema().fields() {
-            let Some((feature, name)) = field.name().strip_prefix("stats/").and_then(|n| n.rsplit_once('/')) else {
+            let Some((feature, name)) = field.name().strip_prefix("stats/").and_then(|n| n.rsplit_once('/'))
+            else {
                 continue;
             };
             let values = flat_numbers(self.column::<ListArray>(field.name())?.value(row));
-            let values = values.ok_or_else(|| damaged(self.path, format!("{:?} holds no numbers", field.name())))?;
+            let values =
+                values.ok_or_else(|| damaged(self.path, format!("{:?} holds no numbers", field.name())))?;
             let entry = stats.entry(feature.to_owned()).or_default();
             match entry.slot(name) {
                 Some(slot) => *slot = values,

@@ -3,7 +3,9 @@
 use gawm_schema::{EncodeError, Encoder, Feature, FeatureData, ImageSpec, Kind, Role, Schema};
 use thiserror::Error;
 
-use crate::{AgeColumns, ImageColumn, ImageFormat, ImageHeader, ImageHeaderError, Rows, VectorColumn, image_header};
+use crate::{
+    AgeColumns, ImageColumn, ImageFormat, ImageHeader, ImageHeaderError, Rows, VectorColumn, image_header,
+};
 
 /// Rows of one episode that keep the data contract of a schema. Not empty.
 #[derive(Debug, Clone, PartialEq)]
@@ -199,11 +201,9 @@ impl Trajectory {
 
 fn check_time(time_ns: &[i64]) -> Result<(), TrajectoryError> {
     match time_ns.windows(2).position(|pair| pair[1] <= pair[0]) {
-        Some(row) => Err(TrajectoryError::Time {
-            row: row + 1,
-            previous_ns: time_ns[row],
-            time_ns: time_ns[row + 1],
-        }),
+        Some(row) => {
+            Err(TrajectoryError::Time { row: row + 1, previous_ns: time_ns[row], time_ns: time_ns[row + 1] })
+        }
         None => Ok(()),
     }
 }
@@ -212,7 +212,12 @@ fn check_columns(what: &'static str, expected: usize, got: usize) -> Result<(), 
     if expected == got { Ok(()) } else { Err(TrajectoryError::Columns { what, expected, got }) }
 }
 
-fn check_length(feature: &str, what: &'static str, expected: usize, got: usize) -> Result<(), TrajectoryError> {
+fn check_length(
+    feature: &str,
+    what: &'static str,
+    expected: usize,
+    got: usize,
+) -> Result<(), TrajectoryError> {
     if expected == got {
         Ok(())
     } else {
@@ -259,7 +264,8 @@ fn is_allowed(value: f64, rule: DimRule) -> bool {
 
 fn value_error(feature: &Feature, dim: usize, row: usize, value: f64, valid: bool) -> TrajectoryError {
     let FeatureData::Vector { parts, .. } = &feature.data else { return TrajectoryError::Empty };
-    let name = parts.iter().flat_map(|part| &part.dims).nth(dim).map(|dim| dim.name.clone()).unwrap_or_default();
+    let name =
+        parts.iter().flat_map(|part| &part.dims).nth(dim).map(|dim| dim.name.clone()).unwrap_or_default();
     let feature = feature.name.clone();
     if !valid {
         TrajectoryError::ValueInInvalidRow { feature, dim: name, row, value }
@@ -332,7 +338,9 @@ fn check_images(
             source,
         })?;
         let is_wrong_format = got.format == ImageFormat::Tiff && !spec.depth;
-        if is_wrong_format || (got.height, got.width, got.channels) != (spec.height, spec.width, spec.channels) {
+        if is_wrong_format
+            || (got.height, got.width, got.channels) != (spec.height, spec.width, spec.channels)
+        {
             return Err(TrajectoryError::ImageSize {
                 feature: feature.to_owned(),
                 row,

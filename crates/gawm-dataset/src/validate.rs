@@ -164,3 +164,28 @@ fn report(
         left_out,
     }
 }
+
+/// What is declared of one dim, for statistics and reports.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DimLabel {
+    /// Name, or the dim's number.
+    pub name: String,
+    /// Unit, empty if none is declared.
+    pub unit: String,
+    /// Whether it is an angle.
+    pub is_angle: bool,
+}
+
+/// Returns what is declared of the dims of a column; nothing for columns that carry no robot data.
+pub fn dim_labels(dataset: &Dataset, column: &str) -> Vec<DimLabel> {
+    let layouts = layout::layouts(dataset);
+    let Some(layout) = layouts.iter().find(|l| l.name == column) else { return Vec::new() };
+    let is_angle =
+        |d: usize| matches!(layout.kinds[d], layout::DimKind::Angle | layout::DimKind::Wrapped { .. });
+    let label = |d: usize| DimLabel {
+        name: layout.names[d].clone(),
+        unit: layout.units[d].clone(),
+        is_angle: is_angle(d),
+    };
+    (0..layout.width()).map(label).collect()
+}

@@ -141,8 +141,14 @@ impl DatasetWriter {
             self.tasks.push(info.task.clone());
             self.tasks.len() - 1
         });
-        recording.episode =
-            Some(OpenEpisode::new(&self.columns, info, n_episodes, task as u64, first_index, self.spec.schema.hash()));
+        recording.episode = Some(OpenEpisode::new(
+            &self.columns,
+            info,
+            n_episodes,
+            task as u64,
+            first_index,
+            self.spec.schema.hash(),
+        ));
         Ok(())
     }
 

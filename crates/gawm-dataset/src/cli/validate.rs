@@ -6,7 +6,9 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 
 use super::{EXIT_CHECK_FAILED, Failure, open, print_result};
-use crate::validate::{DemoReport, Severity, Thresholds, ValidateOptions, render_markdown, render_text, run_demo, validate};
+use crate::validate::{
+    DemoReport, Severity, Thresholds, ValidateOptions, render_markdown, render_text, run_demo, validate,
+};
 
 /// Check a dataset and say what harms training
 ///
@@ -104,7 +106,11 @@ pub(super) fn run(arguments: &ValidateArguments, quiet: bool) -> Result<u8, Fail
 /// Runs the self-test: exit code 0 only if all defects at full strength were found and nothing on clean data.
 fn run_self_test(format: Format) -> Result<u8, Failure> {
     let report = run_demo()?;
-    let text = if format == Format::Json { serde_json::to_string_pretty(&report)? + "\n" } else { demo_table(&report) };
+    let text = if format == Format::Json {
+        serde_json::to_string_pretty(&report)? + "\n"
+    } else {
+        demo_table(&report)
+    };
     print_result(&text)?;
     Ok(if report.is_perfect() { 0 } else { EXIT_CHECK_FAILED })
 }
@@ -117,7 +123,12 @@ fn demo_table(report: &DemoReport) -> String {
     }
     out += &format!(
         "\n{} of {} planted defects found, {} of {} at full strength; {} false alarms on {} clean datasets\n",
-        report.found, report.planted, report.found_at_full_strength, report.planted_at_full_strength, report.false_alarms, report.clean_twins
+        report.found,
+        report.planted,
+        report.found_at_full_strength,
+        report.planted_at_full_strength,
+        report.false_alarms,
+        report.clean_twins
     );
     report.false_alarm_texts.iter().for_each(|text| out += &format!("false alarm: {text}\n"));
     out

@@ -13,7 +13,7 @@ use super::{Severity, ValidateOptions, validate};
 use crate::read::{Dataset, OpenError, ReadLimits, ScanError};
 
 /// Strengths at which each defect is planted; the last is full strength.
-pub const STRENGTHS: [f64; 3] = [0.3, 0.6, 1.0];
+const STRENGTHS: [f64; 3] = [0.3, 0.6, 1.0];
 
 /// Why the self-test could not be run.
 #[derive(Debug, thiserror::Error)]
@@ -72,9 +72,17 @@ pub struct DemoRule {
 /// A synthetic dataset cannot be written, or not be read although its defect leaves it readable.
 pub fn run_demo() -> Result<DemoReport, DemoError> {
     let kinds = defects::DEFECTS;
-    let rules = kinds.par_iter().enumerate().map(|(i, defect)| test_defect(i, defect)).collect::<Result<Vec<_>, _>>()?;
-    let twins: Vec<(u64, bool)> = (0..kinds.len() as u64).map(|i| (i, kinds[i as usize].needs_cameras())).collect();
-    let alarms = twins.par_iter().map(|(seed, cameras)| clean_alarms(*seed, *cameras)).collect::<Result<Vec<_>, _>>()?;
+    let rules = kinds
+        .par_iter()
+        .enumerate()
+        .map(|(i, defect)| test_defect(i, defect))
+        .collect::<Result<Vec<_>, _>>()?;
+    let twins: Vec<(u64, bool)> =
+        (0..kinds.len() as u64).map(|i| (i, kinds[i as usize].needs_cameras())).collect();
+    let alarms = twins
+        .par_iter()
+        .map(|(seed, cameras)| clean_alarms(*seed, *cameras))
+        .collect::<Result<Vec<_>, _>>()?;
     let false_alarm_texts: Vec<String> = alarms.into_iter().flatten().collect();
     let count = |k: usize| rules.iter().filter(|r| r.found[k]).count() as u64;
     Ok(DemoReport {
@@ -113,13 +121,26 @@ fn test_defect(seed: usize, defect: &defects::Defect) -> Result<DemoRule, DemoEr
             }
             Err(e) => return Err(e.into()),
         };
-        let is_it = |f: &&super::Finding| f.code == defect.code && defect.episode.is_none_or(|e| f.episode == Some(e));
+        let is_it = |f: &&super::Finding| {
+            f.code == defect.code && defect.episode.is_none_or(|e| f.episode == Some(e))
+        };
         found[k] = findings.iter().any(|f| is_it(&f) && f.severity >= Severity::Warning);
         if k == 2 {
-            also.extend(findings.iter().filter(|f| f.severity >= Severity::Warning && f.code != defect.code).map(|f| f.code));
+            also.extend(
+                findings
+                    .iter()
+                    .filter(|f| f.severity >= Severity::Warning && f.code != defect.code)
+                    .map(|f| f.code),
+            );
         }
     }
-    Ok(DemoRule { defect: defect.name, code: defect.code, strengths: STRENGTHS, found, also: also.into_iter().collect() })
+    Ok(DemoRule {
+        defect: defect.name,
+        code: defect.code,
+        strengths: STRENGTHS,
+        found,
+        also: also.into_iter().collect(),
+    })
 }
 
 /// Validates a clean dataset and returns what is reported all the same.
@@ -129,7 +150,14 @@ fn clean_alarms(seed: u64, has_cameras: bool) -> Result<Vec<String>, DemoError> 
     let dataset = Dataset::open(dir.path(), ReadLimits::default())?;
     let report = validate(&dataset, &ValidateOptions::default())?;
     let alarms = report.findings.iter().filter(|f| f.severity >= Severity::Warning);
-    Ok(alarms.map(|f| format!("seed {seed}: {} episode {:?} {:?}[{:?}] {}", f.code, f.episode, f.feature, f.dim, f.message)).collect())
+    Ok(alarms
+        .map(|f| {
+            format!(
+                "seed {seed}: {} episode {:?} {:?}[{:?}] {}",
+                f.code, f.episode, f.feature, f.dim, f.message
+            )
+        })
+        .collect())
 }
 
 #[cfg(test)]

@@ -54,7 +54,9 @@ impl FrameReader for Measurer {
         let mut measure = FrameMeasure { hash: 0, mean: 0.0, std: 0.0, is_picture: false, thumb: [0; THUMB] };
         match frame {
             FrameBytes::Absent => run.absent.push(row),
-            FrameBytes::TooLarge(n) => run.note_undecodable(row, format!("{n} bytes are more than are permitted")),
+            FrameBytes::TooLarge(n) => {
+                run.note_undecodable(row, format!("{n} bytes are more than are permitted"))
+            }
             FrameBytes::Encoded(bytes) => {
                 let mut short = [0; 8];
                 short.copy_from_slice(&blake3::hash(&bytes).as_bytes()[..8]);
@@ -65,10 +67,12 @@ impl FrameReader for Measurer {
                         let n = luma.len().max(1) as f64;
                         let mean = luma.iter().map(|v| f64::from(*v)).sum::<f64>() / n;
                         let variance = luma.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum::<f64>() / n;
-                        (measure.mean, measure.std, measure.is_picture) = (mean as f32, variance.sqrt() as f32, true);
+                        (measure.mean, measure.std, measure.is_picture) =
+                            (mean as f32, variance.sqrt() as f32, true);
                         measure.thumb.copy_from_slice(&picture.shrunk(THUMB_SIDE, THUMB_SIDE).luma());
                         if let Some((height, width, channels)) = self.sizes[camera] {
-                            let got = (header.height as usize, header.width as usize, header.channels as usize);
+                            let got =
+                                (header.height as usize, header.width as usize, header.channels as usize);
                             if got != (height, width, channels) {
                                 run.n_wrong_size += 1;
                                 if run.wrong_size.len() < 4 {
@@ -110,8 +114,12 @@ pub(super) fn judge(
     if cameras.is_empty() {
         return (Vec::new(), Vec::new());
     }
-    let sizes: Vec<_> = cameras.iter().map(|c| dataset.info.feature(c).and_then(|f| f.image_size())).collect();
-    let begin = |_: usize, _: &Run| Measurer { sizes: sizes.clone(), cameras: vec![CameraRun::default(); cameras.len()] };
+    let sizes: Vec<_> =
+        cameras.iter().map(|c| dataset.info.feature(c).and_then(|f| f.image_size())).collect();
+    let begin = |_: usize, _: &Run| Measurer {
+        sizes: sizes.clone(),
+        cameras: vec![CameraRun::default(); cameras.len()],
+    };
     let (measured, defects) = dataset.scan_frames(&cameras, begin, progress);
     let by_index: BTreeMap<usize, &RunProfile> = runs.iter().map(|r| (r.run_index, r)).collect();
     let mut findings = Vec::new();
@@ -147,31 +155,57 @@ impl Judge<'_> {
         for (run, camera) in self.runs {
             if let Some((row, reason)) = camera.undecodable.first() {
                 let message = format!("{} frames cannot be decoded: {reason}", camera.n_undecodable);
-                findings.push(self.finding("IMAGE-001", run, message).rows(*row, row + 1).measured(camera.n_undecodable as f64, 0.0));
+                findings.push(
+                    self.finding("IMAGE-001", run, message)
+                        .rows(*row, row + 1)
+                        .measured(camera.n_undecodable as f64, 0.0),
+                );
             }
             if let (Some(first), Some(last)) = (camera.absent.first(), camera.absent.last()) {
                 let message = format!("{} frames are missing", camera.absent.len());
-                findings.push(self.finding("IMAGE-002", run, message).rows(*first, last + 1).measured(camera.absent.len() as f64, 0.0));
+                findings.push(
+                    self.finding("IMAGE-002", run, message)
+                        .rows(*first, last + 1)
+                        .measured(camera.absent.len() as f64, 0.0),
+                );
             }
-            if let (Some((row, h, w, c)), Some((height, width, channels))) = (camera.wrong_size.first(), self.sizes) {
-                let message = format!("{} frames have another size: expected {height} x {width} x {channels}, got {h} x {w} x {c}", camera.n_wrong_size);
-                findings.push(self.finding("IMAGE-003", run, message).rows(*row, row + 1).measured(camera.n_wrong_size as f64, 0.0));
+            if let (Some((row, h, w, c)), Some((height, width, channels))) =
+                (camera.wrong_size.first(), self.sizes)
+            {
+                let message = format!(
+                    "{} frames have another size: expected {height} x {width} x {channels}, got {h} x {w} x {c}",
+                    camera.n_wrong_size
+                );
+                findings.push(
+                    self.finding("IMAGE-003", run, message)
+                        .rows(*row, row + 1)
+                        .measured(camera.n_wrong_size as f64, 0.0),
+                );
             }
         }
     }
 
     fn flat(&self, findings: &mut Vec<Finding>) {
         let bounds = &self.thresholds.image;
-        let is_black = |f: &FrameMeasure| f.is_picture && f64::from(f.mean) < bounds.black_luma && f64::from(f.std) < bounds.flat_luma;
-        let is_white = |f: &FrameMeasure| f.is_picture && f64::from(f.mean) > bounds.white_luma && f64::from(f.std) < bounds.flat_luma;
+        let is_black = |f: &FrameMeasure| {
+            f.is_picture && f64::from(f.mean) < bounds.black_luma && f64::from(f.std) < bounds.flat_luma
+        };
+        let is_white = |f: &FrameMeasure| {
+            f.is_picture && f64::from(f.mean) > bounds.white_luma && f64::from(f.std) < bounds.flat_luma
+        };
         for (run, camera) in self.runs {
-            let cases: [(&str, &str, &dyn Fn(&FrameMeasure) -> bool); 2] = [("IMAGE-004", "black", &is_black), ("IMAGE-005", "white", &is_white)];
+            let cases: [(&str, &str, &dyn Fn(&FrameMeasure) -> bool); 2] =
+                [("IMAGE-004", "black", &is_black), ("IMAGE-005", "white", &is_white)];
             for (code, what, is_flat) in cases {
                 let Some(first) = camera.frames.iter().position(is_flat) else { continue };
                 let n = camera.frames.iter().filter(|f| is_flat(f)).count();
                 let n_rows = camera.frames[first..].iter().take_while(|f| is_flat(f)).count();
                 let code = if code == "IMAGE-004" { "IMAGE-004" } else { "IMAGE-005" };
-                findings.push(self.finding(code, run, format!("{n} frames are {what}")).rows(first, first + n_rows).measured(n as f64, 0.0));
+                findings.push(
+                    self.finding(code, run, format!("{n} frames are {what}"))
+                        .rows(first, first + n_rows)
+                        .measured(n as f64, 0.0),
+                );
             }
         }
     }
@@ -186,7 +220,8 @@ impl Judge<'_> {
         let shortest = (self.thresholds.image.frozen_secs * self.fps).max(5.0);
         for ((run, _), measure) in self.runs.iter().zip(&measures) {
             let frozen = measure.frozen;
-            let is_frozen = frozen.n_rows as f64 >= shortest && frozen.n_rows as f64 > 3.0 * usual_frozen.min(shortest);
+            let is_frozen =
+                frozen.n_rows as f64 >= shortest && frozen.n_rows as f64 > 3.0 * usual_frozen.min(shortest);
             if is_frozen && measure.motion > 0.3 {
                 let message = format!("{} frames are the same while the robot moves", frozen.n_rows);
                 let finding = self.finding("IMAGE-006", run, message).rows(frozen.start, frozen.end());
@@ -194,10 +229,19 @@ impl Judge<'_> {
             }
             // A camera slower than the rows repeats by nature.
             let is_nature = n_repeated as f64 > 0.05 * n_frames as f64;
-            let beside: Vec<usize> = measure.repeated.iter().copied().filter(|r| !is_frozen || !(frozen.start..frozen.end()).contains(r)).collect();
+            let beside: Vec<usize> = measure
+                .repeated
+                .iter()
+                .copied()
+                .filter(|r| !is_frozen || !(frozen.start..frozen.end()).contains(r))
+                .collect();
             if let Some(first) = beside.first().filter(|_| !is_nature) {
                 let message = format!("{} frames repeat an earlier one while the robot moves", beside.len());
-                findings.push(self.finding("IMAGE-007", run, message).rows(*first, first + 1).measured(beside.len() as f64, 0.0));
+                findings.push(
+                    self.finding("IMAGE-007", run, message)
+                        .rows(*first, first + 1)
+                        .measured(beside.len() as f64, 0.0),
+                );
             }
         }
     }
@@ -211,7 +255,8 @@ impl Judge<'_> {
                 if w.iter().any(|f| !f.is_picture) {
                     continue;
                 }
-                let (before, after, across) = (distance(&w[0], &w[1]), distance(&w[1], &w[2]), distance(&w[0], &w[2]));
+                let (before, after, across) =
+                    (distance(&w[0], &w[1]), distance(&w[1], &w[2]), distance(&w[0], &w[2]));
                 let here = before.min(after);
                 if here > ratio * across.max(1.0) {
                     odd.push((t + 1, here / across.max(1.0)));
@@ -227,8 +272,12 @@ impl Judge<'_> {
         }
         for (run, odd) in events {
             if let Some((row, size)) = odd.first() {
-                let message = format!("{} frames differ from both neighbours, {size:.0} times more than these from each other", odd.len());
-                findings.push(self.finding("IMAGE-008", run, message).rows(*row, row + 1).measured(*size, ratio));
+                let message = format!(
+                    "{} frames differ from both neighbours, {size:.0} times more than these from each other",
+                    odd.len()
+                );
+                findings
+                    .push(self.finding("IMAGE-008", run, message).rows(*row, row + 1).measured(*size, ratio));
             }
         }
     }
@@ -238,35 +287,48 @@ impl Judge<'_> {
             return;
         }
         let of = |camera: &CameraRun, f: fn(&FrameMeasure) -> f32| {
-            median(&camera.frames.iter().filter(|m| m.is_picture).map(|m| f64::from(f(m))).collect::<Vec<_>>())
+            median(
+                &camera.frames.iter().filter(|m| m.is_picture).map(|m| f64::from(f(m))).collect::<Vec<_>>(),
+            )
         };
-        let measures: [(&str, fn(&FrameMeasure) -> f32); 2] = [("brightness", |f| f.mean), ("contrast", |f| f.std)];
+        let measures: [(&str, fn(&FrameMeasure) -> f32); 2] =
+            [("brightness", |f| f.mean), ("contrast", |f| f.std)];
         for (what, measure) in measures {
             let levels: Vec<f64> = self.runs.iter().map(|(_, c)| of(c, measure)).collect();
             let (centre, scale) = centre_and_scale(&levels);
             let bound = (self.thresholds.image.exposure_sigmas * scale).max(20.0);
-            for ((run, _), level) in self.runs.iter().zip(&levels).filter(|(_, l)| (**l - centre).abs() > bound) {
+            for ((run, _), level) in
+                self.runs.iter().zip(&levels).filter(|(_, l)| (**l - centre).abs() > bound)
+            {
                 let message = format!("{what} is {level:.0} of 255, in the other episodes about {centre:.0}");
-                findings.push(self.finding("IMAGE-010", run, message).measured((level - centre).abs(), bound));
+                findings
+                    .push(self.finding("IMAGE-010", run, message).measured((level - centre).abs(), bound));
             }
         }
     }
 
     /// Compares the change of pictures with the speed of the robot at different lags.
     fn lag(&self, findings: &mut Vec<Finding>) {
-        let lags: Vec<Option<(i64, f64)>> = self.runs.iter().map(|(run, camera)| lag_of(run, camera)).collect();
-        let known: Vec<f64> = lags.iter().flatten().map(|l| l.0 as f64).collect();
+        let lags: Vec<Option<Vec<f64>>> =
+            self.runs.iter().map(|(run, camera)| lag_correlations(run, camera)).collect();
+        let known: Vec<f64> = lags.iter().flatten().map(|l| best_lag(l).0 as f64).collect();
         if known.len() < 4 {
             return;
         }
         let (usual, scale) = centre_and_scale(&known);
         let bound = (4.0 * scale).max(self.thresholds.image.lag_rows);
-        for ((run, _), lag) in self.runs.iter().zip(&lags) {
-            if let Some((lag, correlation)) = lag
-                && (*lag as f64 - usual).abs() >= bound
-            {
-                let message = format!("pictures follow the motion by {lag} rows (correlation {correlation:.2}), in the other episodes by {usual:.0}");
-                findings.push(self.finding("IMAGE-016", run, message).measured((*lag as f64 - usual).abs(), bound));
+        for ((run, _), correlations) in self.runs.iter().zip(&lags) {
+            let Some(correlations) = correlations else { continue };
+            let (lag, correlation) = best_lag(correlations);
+            let at_usual =
+                correlations[(usual.round() as i64 + MAX_LAG as i64).clamp(0, 2 * MAX_LAG as i64) as usize];
+            if (lag as f64 - usual).abs() >= bound && correlation - at_usual > 0.2 {
+                let message = format!(
+                    "pictures follow the motion by {lag} rows (correlation {correlation:.2}), in the other episodes by {usual:.0} ({at_usual:.2} here)"
+                );
+                findings.push(
+                    self.finding("IMAGE-016", run, message).measured((lag as f64 - usual).abs(), bound),
+                );
             }
         }
     }
@@ -303,7 +365,8 @@ fn repeats_of(run: &RunProfile, camera: &CameraRun) -> Repeats {
     }
     let frozen = repeats.frozen;
     if frozen.n_rows > 1 {
-        repeats.motion = (frozen.start + 1..frozen.end()).map(speed).sum::<f64>() / (frozen.n_rows - 1) as f64;
+        repeats.motion =
+            (frozen.start + 1..frozen.end()).map(speed).sum::<f64>() / (frozen.n_rows - 1) as f64;
     }
     repeats
 }
@@ -313,24 +376,30 @@ fn distance(a: &FrameMeasure, b: &FrameMeasure) -> f64 {
     a.thumb.iter().zip(&b.thumb).map(|(x, y)| f64::from(x.abs_diff(*y))).sum::<f64>() / THUMB as f64
 }
 
-/// Returns the lag at which changes of the picture correlate best with speed, if it is clear.
-fn lag_of(run: &RunProfile, camera: &CameraRun) -> Option<(i64, f64)> {
+/// Returns the correlation of changes of the picture with speed at lags of -12..=12 rows, if one is clear.
+fn lag_correlations(run: &RunProfile, camera: &CameraRun) -> Option<Vec<f64>> {
     let frames = &camera.frames;
     if frames.len() < 8 * MAX_LAG || run.speed.len() != frames.len() || frames.iter().any(|f| !f.is_picture) {
         return None;
     }
-    let change: Vec<f64> = std::iter::once(0.0).chain(frames.windows(2).map(|w| distance(&w[0], &w[1]))).collect();
-    let correlation = |lag: i64| {
+    let change: Vec<f64> =
+        std::iter::once(0.0).chain(frames.windows(2).map(|w| distance(&w[0], &w[1]))).collect();
+    let correlation = |k: usize| {
         let mut pair = Pair::default();
         for t in MAX_LAG..frames.len() - MAX_LAG {
-            pair.add(f64::from(run.speed[t]), change[(t as i64 + lag) as usize]);
+            pair.add(f64::from(run.speed[t]), change[t + k - MAX_LAG]);
         }
         pair.correlation()
     };
-    let all: Vec<(i64, f64)> = (-(MAX_LAG as i64)..=MAX_LAG as i64).map(|lag| (lag, correlation(lag))).collect();
-    let best = all.iter().copied().max_by(|a, b| a.1.total_cmp(&b.1))?;
+    let all: Vec<f64> = (0..=2 * MAX_LAG).map(correlation).collect();
+    let (lag, best) = best_lag(&all);
     // At the rim of the search the true lag is unknown.
-    (best.1 > 0.5 && best.0.unsigned_abs() < MAX_LAG as u64).then_some(best)
+    (best > 0.5 && lag.unsigned_abs() < MAX_LAG as u64).then_some(all)
+}
+
+fn best_lag(correlations: &[f64]) -> (i64, f64) {
+    let best = correlations.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1));
+    best.map_or((0, 0.0), |(k, c)| (k as i64 - MAX_LAG as i64, *c))
 }
 
 /// Finds episodes in which two cameras have changed places.
@@ -347,7 +416,8 @@ fn exchanged(
         let n = camera.frames.len().max(1) as f64;
         (0..THUMB).map(|i| camera.frames.iter().map(|f| f64::from(f.thumb[i])).sum::<f64>() / n).collect()
     };
-    let thumbs: Vec<Vec<Vec<f64>>> = measured.iter().map(|(_, m)| m.iter().map(mean_thumb).collect()).collect();
+    let thumbs: Vec<Vec<Vec<f64>>> =
+        measured.iter().map(|(_, m)| m.iter().map(mean_thumb).collect()).collect();
     let usual: Vec<Vec<f64>> = (0..cameras.len())
         .map(|c| (0..THUMB).map(|i| median(&thumbs.iter().map(|t| t[c][i]).collect::<Vec<_>>())).collect())
         .collect();
@@ -358,9 +428,17 @@ fn exchanged(
                 let own = far(&thumbs[a], &usual[a]) + far(&thumbs[b], &usual[b]);
                 let other = far(&thumbs[a], &usual[b]) + far(&thumbs[b], &usual[a]);
                 if other < 0.5 * own && own > 10.0 {
-                    let message = format!("{} shows what {} shows in the other episodes, and the other way round", cameras[a], cameras[b]);
+                    let message = format!(
+                        "{} shows what {} shows in the other episodes, and the other way round",
+                        cameras[a], cameras[b]
+                    );
                     let episode = by_index.get(run).map_or(-1, |r| r.episode);
-                    findings.push(Finding::new("IMAGE-009", message).episode(episode).feature(&cameras[a]).measured(own / other.max(1e-9), 2.0));
+                    findings.push(
+                        Finding::new("IMAGE-009", message)
+                            .episode(episode)
+                            .feature(&cameras[a])
+                            .measured(own / other.max(1e-9), 2.0),
+                    );
                 }
             }
         }
@@ -373,7 +451,12 @@ pub(super) fn judge_videos(dataset: &Dataset) -> Vec<Finding> {
     for feature in dataset.info.features.iter().filter(|f| f.dtype == DType::Video) {
         let mut by_file: BTreeMap<String, (Vec<i64>, u64)> = BTreeMap::new();
         for entry in &dataset.episodes {
-            let n_rows: u64 = dataset.runs.iter().filter(|r| r.episode_index == entry.episode_index).map(|r| r.n_rows).sum();
+            let n_rows: u64 = dataset
+                .runs
+                .iter()
+                .filter(|r| r.episode_index == entry.episode_index)
+                .map(|r| r.n_rows)
+                .sum();
             if n_rows == 0 {
                 continue;
             }
@@ -383,14 +466,21 @@ pub(super) fn judge_videos(dataset: &Dataset) -> Vec<Finding> {
                     file.0.push(entry.episode_index);
                     file.1 += n_rows;
                 }
-                Some(Err(got)) => findings.push(Finding::new("STRUCT-003", format!("video_path: {got}")).feature(&feature.name)),
+                Some(Err(got)) => findings
+                    .push(Finding::new("STRUCT-003", format!("video_path: {got}")).feature(&feature.name)),
                 None => {}
             }
         }
         let is_any_there = by_file.keys().any(|p| dataset.root.join(p).is_file());
         if !is_any_there && !by_file.is_empty() {
-            let message = format!("none of {} video files exists, the first is {}", by_file.len(), by_file.keys().next().map_or("", String::as_str));
-            findings.push(Finding::new("IMAGE-011", message).feature(&feature.name).measured(by_file.len() as f64, 0.0));
+            let message = format!(
+                "none of {} video files exists, the first is {}",
+                by_file.len(),
+                by_file.keys().next().map_or("", String::as_str)
+            );
+            findings.push(
+                Finding::new("IMAGE-011", message).feature(&feature.name).measured(by_file.len() as f64, 0.0),
+            );
             continue;
         }
         for (path, (episodes, n_rows)) in &by_file {
@@ -426,7 +516,11 @@ fn judge_video(
     if track.n_frames != n_rows {
         // A file that other episodes share may hold more than those that lie here.
         let is_shared = !dataset.info.version.is_v2() && track.n_frames > n_rows;
-        let message = format!("{path} has {} frames, its {} episodes have {n_rows} rows", track.n_frames, episodes.len());
+        let message = format!(
+            "{path} has {} frames, its {} episodes have {n_rows} rows",
+            track.n_frames,
+            episodes.len()
+        );
         let found = finding("IMAGE-013", message).measured(track.n_frames as f64, n_rows as f64);
         findings.push(if is_shared { found.at(Severity::Warning) } else { found });
     }
@@ -438,7 +532,8 @@ fn judge_video(
     }
     let error = track.max_grid_error_secs(dataset.info.fps);
     if error > 0.5 / dataset.info.fps {
-        let message = format!("{path}: frames are up to {error:.4} s off the grid of {} Hz", dataset.info.fps);
+        let message =
+            format!("{path}: frames are up to {error:.4} s off the grid of {} Hz", dataset.info.fps);
         findings.push(finding("IMAGE-015", message).measured(error, 0.5 / dataset.info.fps));
     }
 }

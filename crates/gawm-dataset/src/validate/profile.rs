@@ -310,27 +310,36 @@ fn motion_profile(states: &[&Vec<f64>], actions: &[&Vec<f64>], scales: &[f64]) -
     (profile, speed)
 }
 
-/// Returns how many steps at the speed before and after fit into the step at `t`, 0 if the directions disagree.
+/// Returns how many steps at the speed before and after fit into the step at `t`, 0 if that is no explanation.
+///
+/// Either the step points where the robot was going, or most dims make a long step at once.
 fn squeezed_steps(used: &[usize], step: &impl Fn(usize, usize) -> f64, t: usize) -> f64 {
-    let (mut dv, mut vv, mut dd, mut before_after, mut bb, mut aa, mut top) =
-        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0f64);
+    let (mut dv, mut vv, mut dd, mut top) = (0.0, 0.0, 0.0, 0.0f64);
+    let mut ratios = Vec::with_capacity(used.len());
     for &d in used {
-        let (before, after, here) =
-            (0.5 * (step(d, t - 2) + step(d, t - 1)), 0.5 * (step(d, t + 1) + step(d, t + 2)), step(d, t));
-        let v = 0.5 * (before + after);
+        let (before, after) =
+            (0.5 * (step(d, t - 2) + step(d, t - 1)), 0.5 * (step(d, t + 1) + step(d, t + 2)));
+        let (here, v) = (step(d, t), 0.5 * (before + after));
         dv += here * v;
         vv += v * v;
         dd += here * here;
-        before_after += before * after;
-        bb += before * before;
-        aa += after * after;
         top = top.max(here * here);
+        // Steps are in units of the dim's usual step: a dim at rest is measured by that.
+        ratios.push(here.abs() / before.abs().max(after.abs()).max(0.5));
     }
-    let is_steady = before_after > 0.8 * (bb * aa).sqrt();
-    let is_along = dv > 0.9 * (dd * vv).sqrt();
     // A jump of one dim alone is another matter.
-    let is_shared = used.len() < 2 || top < 0.9 * dd;
-    if is_steady && is_along && is_shared && vv > 0.0 { dv / vv } else { 0.0 }
+    if used.len() >= 2 && top > 0.9 * dd {
+        return 0.0;
+    }
+    let long = ratios.iter().filter(|r| **r > 2.0).count();
+    let ratio = super::robust::median(&ratios);
+    if vv > 0.0 && dv > 0.9 * (dd * vv).sqrt() {
+        dv / vv
+    } else if used.len() >= 3 && long as f64 >= 0.6 * used.len() as f64 {
+        ratio
+    } else {
+        0.0
+    }
 }
 
 fn row_rests(is_equal: &[bool], profile: &mut MotionProfile) {

@@ -221,9 +221,9 @@ impl Context<'_> {
                         .measured(-age[row], 0.0),
                 );
             }
-            // A slow stream is old by nature: what counts is more than three times its usual age.
-            let usual = quantile(age, 0.9);
-            let is_stale = |a: &&f64| a.is_finite() && **a > stale && **a > 3.0 * usual;
+            // A slow stream is old by nature: what counts is several times its usual age.
+            let usual = median(age);
+            let is_stale = |a: &&f64| a.is_finite() && **a > stale && **a > 4.0 * usual;
             if let Some(row) = age.iter().position(|a| is_stale(&a)) {
                 let n_rows = age[row..].iter().take_while(|a| is_stale(a)).count();
                 let worst = age.iter().filter(is_stale).copied().fold(0.0, f64::max);

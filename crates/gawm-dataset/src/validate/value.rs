@@ -78,7 +78,8 @@ impl Judge<'_> {
     fn is_idle(&self, dim: usize) -> bool {
         let layout = &self.plan.layouts[self.feature];
         let peers = (0..layout.width()).filter(|d| layout.units[*d] == layout.units[dim]);
-        let largest = peers.map(|d| self.typical(d, Signal::range)).filter(|r| r.is_finite()).fold(0.0, f64::max);
+        let largest =
+            peers.map(|d| self.typical(d, Signal::range)).filter(|r| r.is_finite()).fold(0.0, f64::max);
         self.typical(dim, Signal::range) < IDLE_SHARE * largest
     }
 
@@ -243,7 +244,9 @@ impl Judge<'_> {
         let n_jumping = counts.iter().filter(|c| **c > 0).count();
         // A signal that jumps everywhere is made of steps: set points, not measurements.
         let is_stepping = counts.iter().sum::<usize>() as f64 > 0.005 * n_rows as f64
-            || (counts.len() >= MIN_RUNS && n_jumping * 2 > counts.len() && counts.iter().sum::<usize>() > 3 * counts.len());
+            || (counts.len() >= MIN_RUNS
+                && n_jumping * 2 > counts.len()
+                && counts.iter().sum::<usize>() > 3 * counts.len());
         if is_stepping {
             return;
         }

@@ -84,7 +84,12 @@ impl OpenEpisode {
     }
 
     /// Takes rows; full blocks go to the file.
-    pub(super) fn write(&mut self, columns: &Columns, file: &mut DataFile, rows: Rows) -> Result<(), WriteError> {
+    pub(super) fn write(
+        &mut self,
+        columns: &Columns,
+        file: &mut DataFile,
+        rows: Rows,
+    ) -> Result<(), WriteError> {
         check_shape(columns, &rows)?;
         self.check_continuity(columns, &rows)?;
         let mut start = 0;
@@ -107,7 +112,11 @@ impl OpenEpisode {
     }
 
     /// Writes what is left and closes the row group.
-    pub(super) fn finish(mut self, columns: &Columns, file: &mut DataFile) -> Result<DoneEpisode, WriteError> {
+    pub(super) fn finish(
+        mut self,
+        columns: &Columns,
+        file: &mut DataFile,
+    ) -> Result<DoneEpisode, WriteError> {
         self.flush(columns, file)?;
         file.end_row_group().map_err(WriteError::parquet(file.path()))?;
         let info = self.info;
@@ -153,7 +162,8 @@ impl OpenEpisode {
             first_frame: self.n_written as i64,
             first_index: (self.first_index + self.n_written) as i64,
         };
-        file.write(columns, &self.block, position, self.block_bytes).map_err(WriteError::parquet(file.path()))?;
+        file.write(columns, &self.block, position, self.block_bytes)
+            .map_err(WriteError::parquet(file.path()))?;
         self.totals.update(columns, &self.block);
         self.hash_block(columns);
         self.n_written += self.block.len() as u64;

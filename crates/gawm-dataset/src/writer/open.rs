@@ -13,7 +13,9 @@ use crate::durable::{Disk, TEMPORARY, remove_file, temporary};
 use crate::episode::EpisodeRecord;
 use crate::error::WriteError;
 use crate::journal::{Base, DoneRecording, Journal, RunRecord, load};
-use crate::layout::{ATTACHMENTS, CALIBRATION, EPISODES, FORMAT_VERSION, GAWM, INFO, STATISTICS, TASKS, data_path};
+use crate::layout::{
+    ATTACHMENTS, CALIBRATION, EPISODES, FORMAT_VERSION, GAWM, INFO, STATISTICS, TASKS, data_path,
+};
 use crate::provenance::{Contract, GawmMeta};
 use crate::scan::scan_recording;
 use crate::spec::{DatasetSpec, WriteMode};
@@ -133,7 +135,8 @@ impl DatasetWriter {
     /// Removes what an interrupted run left of a recording that it did not finish.
     fn remove_leftovers(&self) -> Result<(), WriteError> {
         let files = self.meta.recordings.iter().flat_map(|recording| &recording.files);
-        let kept: BTreeSet<PathBuf> = files.map(|file| temporary(&self.dir.join(data_path(file.number)))).collect();
+        let kept: BTreeSet<PathBuf> =
+            files.map(|file| temporary(&self.dir.join(data_path(file.number)))).collect();
         let mut leftovers = Vec::new();
         for folder in ["data", "meta", "gawm"] {
             list_temporary(&self.dir.join(folder), &mut leftovers)?;
@@ -162,7 +165,8 @@ fn find_base(dir: &Path, spec: &DatasetSpec, base: Base) -> Result<Found, WriteE
     let mut meta: GawmMeta = load(&path)?;
     check_version(&path, meta.format_version)?;
     if meta.recordings.len() < base.recordings {
-        let reason = format!("expected {} recordings or more, got {}", base.recordings, meta.recordings.len());
+        let reason =
+            format!("expected {} recordings or more, got {}", base.recordings, meta.recordings.len());
         return Err(WriteError::Damaged { path, reason });
     }
     meta.recordings.truncate(base.recordings);
@@ -187,7 +191,8 @@ fn finished_base(dir: &Path) -> Result<Base, WriteError> {
         })
     };
     if number("total_episodes")? != episodes {
-        let reason = format!("total_episodes is {}, but meta/gawm.json has {episodes}", number("total_episodes")?);
+        let reason =
+            format!("total_episodes is {}, but meta/gawm.json has {episodes}", number("total_episodes")?);
         return Err(WriteError::Damaged { path: dir.join(INFO), reason });
     }
     let cameras: BTreeMap<_, _> = statistics.cameras;
@@ -211,7 +216,9 @@ fn check_version(path: &Path, version: u32) -> Result<(), WriteError> {
 fn check_fits(meta: &GawmMeta, spec: &DatasetSpec, mode: WriteMode) -> Result<(), WriteError> {
     check_equal("schema", &meta.schema, &spec.schema)?;
     check_equal("train_share", &meta.train_share, &spec.train_share)?;
-    if mode == WriteMode::Resume && !meta.contracts.is_empty() && !meta.contracts.contains(&Contract::new(&spec.contract))
+    if mode == WriteMode::Resume
+        && !meta.contracts.is_empty()
+        && !meta.contracts.contains(&Contract::new(&spec.contract))
     {
         check_equal("contract", &meta.contracts[0].text, &spec.contract)?;
     }

@@ -155,7 +155,8 @@ pub(crate) fn rows(seed: u64, range: std::ops::Range<usize>, n: usize) -> Rows {
 
 pub(crate) fn recording(number: u64) -> RecordingInfo {
     let hash = ContentHash::of(&number.to_le_bytes());
-    let file = SourceFile { name: format!("log-{number}.mcap"), content_hash: hash, length_bytes: 1000 + number };
+    let file =
+        SourceFile { name: format!("log-{number}.mcap"), content_hash: hash, length_bytes: 1000 + number };
     RecordingInfo { content_hash: hash, files: vec![file], notes: BTreeMap::new() }
 }
 

@@ -33,16 +33,36 @@ const fn whole(name: &'static str, code: &'static str, plant: fn(&mut World, f64
 /// All defects.
 pub(super) const DEFECTS: &[Defect] = &[
     whole("declared column missing", "STRUCT-007", |w, s| {
-        w.folder.dropped_column = Some(if s < 0.5 { "observation.heading" } else if s < 0.9 { "action" } else { "index" });
+        w.folder.dropped_column = Some(if s < 0.5 {
+            "observation.heading"
+        } else if s < 0.9 {
+            "action"
+        } else {
+            "index"
+        });
     }),
     whole("undeclared column", "STRUCT-008", |w, s| {
-        w.folder.extra_column = Some(if s < 0.5 { "note" } else if s < 0.9 { "observation.extra" } else { "action_2" });
+        w.folder.extra_column = Some(if s < 0.5 {
+            "note"
+        } else if s < 0.9 {
+            "observation.extra"
+        } else {
+            "action_2"
+        });
     }),
     whole("column of another type", "STRUCT-009", |w, s| {
-        w.folder.action_dtype = Some(if s < 0.5 { "int64" } else if s < 0.9 { "bool" } else { "string" });
+        w.folder.action_dtype = Some(if s < 0.5 {
+            "int64"
+        } else if s < 0.9 {
+            "bool"
+        } else {
+            "string"
+        });
     }),
     here("null rows", "STRUCT-010", |w, s| w.episodes[SICK].null_states = (50..50 + up_to(s, 10)).collect()),
-    here("lists of the wrong length", "STRUCT-011", |w, s| w.episodes[SICK].short_states = (60..60 + up_to(s, 10)).collect()),
+    here("lists of the wrong length", "STRUCT-011", |w, s| {
+        w.episodes[SICK].short_states = (60..60 + up_to(s, 10)).collect()
+    }),
     here("episodes out of order", "STRUCT-012", |w, s| {
         let mut order: Vec<usize> = (0..w.episodes.len()).collect();
         let moved = order.remove(SICK);
@@ -50,7 +70,9 @@ pub(super) const DEFECTS: &[Defect] = &[
         w.folder.order = Some(order);
     }),
     whole("wrong frame count", "STRUCT-013", |w, s| w.folder.extra_frames = up_to(s, 500) as i64),
-    here("wrong episode length", "STRUCT-014", |w, s| w.folder.extra_length = vec![(SICK, -(up_to(s, 40) as i64))]),
+    here("wrong episode length", "STRUCT-014", |w, s| {
+        w.folder.extra_length = vec![(SICK, -(up_to(s, 40) as i64))]
+    }),
     whole("task table without index", "STRUCT-015", |w, _| w.folder.without_pandas = true),
     here("broken global index", "STRUCT-017", |w, s| {
         let n = w.episodes[SICK].n_rows();
@@ -65,10 +87,18 @@ pub(super) const DEFECTS: &[Defect] = &[
     whole("statistics that are no JSON", "STRUCT-002", |w, _| w.folder.garbled_meta = true),
     whole("data file cut off", "STRUCT-005", |w, s| w.folder.cut_bytes = Some(0.5 * s)),
     whole("path that leaves the folder", "STRUCT-003", |w, s| {
-        let path = if s < 0.5 { "../data/file-{file_index:03d}.parquet" } else if s < 0.9 { "/tmp/file-{file_index:03d}.parquet" } else { "data/../../../x.parquet" };
+        let path = if s < 0.5 {
+            "../data/file-{file_index:03d}.parquet"
+        } else if s < 0.9 {
+            "/tmp/file-{file_index:03d}.parquet"
+        } else {
+            "data/../../../x.parquet"
+        };
         w.folder.data_path = Some(path.to_owned());
     }),
-    here("equal times", "TIME-001", |w, s| each(&mut w.episodes[SICK], up_to(s, 5), |e, t| e.time_ns[t] = e.time_ns[t - 1])),
+    here("equal times", "TIME-001", |w, s| {
+        each(&mut w.episodes[SICK], up_to(s, 5), |e, t| e.time_ns[t] = e.time_ns[t - 1])
+    }),
     here("backward time", "TIME-002", |w, s| {
         let back = (s * 2e9) as i64;
         w.episodes[SICK].time_ns[120..].iter_mut().for_each(|t| *t -= back);
@@ -93,24 +123,36 @@ pub(super) const DEFECTS: &[Defect] = &[
             groups.into_iter().flatten().for_each(|dim| dim[t] = dim[t - 1]);
         });
     }),
-    here("samples from the future", "TIME-010", |w, s| each(&mut w.episodes[SICK], up_to(s, 20), |e, t| e.age_ms[1][t] = -30.0)),
+    here("samples from the future", "TIME-010", |w, s| {
+        each(&mut w.episodes[SICK], up_to(s, 20), |e, t| e.age_ms[1][t] = -30.0)
+    }),
     here("stale samples", "TIME-011", |w, s| {
         (0..up_to(s, 40)).for_each(|k| w.episodes[SICK].age_ms[1][90 + k] = 350.0 + 33.0 * k as f64);
     }),
     here("drifting stream", "TIME-012", |w, s| {
         w.episodes[SICK].arrival_age_ms[1].iter_mut().enumerate().for_each(|(t, a)| *a += s * t as f64 * 0.1);
     }),
-    here("stamps of another clock", "TIME-013", |w, s| w.episodes[SICK].arrival_age_ms[0].iter_mut().for_each(|a| *a -= s * 36e5)),
+    here("stamps of another clock", "TIME-013", |w, s| {
+        w.episodes[SICK].arrival_age_ms[0].iter_mut().for_each(|a| *a -= s * 36e5)
+    }),
     here("undecodable frames", "IMAGE-001", |w, s| {
         each(&mut w.episodes[SICK], up_to(s, 5), |e, t| {
             let cut = e.frames[0][t].as_ref().map(|f| f.slice(..f.len() / 2));
             e.frames[0][t] = cut;
         });
     }),
-    here("missing frames", "IMAGE-002", |w, s| each(&mut w.episodes[SICK], up_to(s, 5), |e, t| e.frames[1][t] = None)),
-    here("frames of another size", "IMAGE-003", |w, s| each(&mut w.episodes[SICK], up_to(s, 5), |e, t| e.frames[0][t] = Some(flat_frame(90, 2)))),
-    here("black frames", "IMAGE-004", |w, s| w.episodes[SICK].frames[0][70..70 + up_to(s, 12)].fill(Some(flat_frame(2, 1)))),
-    here("white frames", "IMAGE-005", |w, s| w.episodes[SICK].frames[0][70..70 + up_to(s, 12)].fill(Some(flat_frame(254, 1)))),
+    here("missing frames", "IMAGE-002", |w, s| {
+        each(&mut w.episodes[SICK], up_to(s, 5), |e, t| e.frames[1][t] = None)
+    }),
+    here("frames of another size", "IMAGE-003", |w, s| {
+        each(&mut w.episodes[SICK], up_to(s, 5), |e, t| e.frames[0][t] = Some(flat_frame(90, 2)))
+    }),
+    here("black frames", "IMAGE-004", |w, s| {
+        w.episodes[SICK].frames[0][70..70 + up_to(s, 12)].fill(Some(flat_frame(2, 1)))
+    }),
+    here("white frames", "IMAGE-005", |w, s| {
+        w.episodes[SICK].frames[0][70..70 + up_to(s, 12)].fill(Some(flat_frame(254, 1)))
+    }),
     here("frozen camera", "IMAGE-006", |w, s| {
         let frame = w.episodes[SICK].frames[1][70].clone();
         w.episodes[SICK].frames[1][70..70 + 8 + up_to(s, 50)].fill(frame);
@@ -139,7 +181,9 @@ pub(super) const DEFECTS: &[Defect] = &[
         }
     }),
     here("NaN", "VALUE-001", |w, s| w.episodes[SICK].state[2][90..90 + up_to(s, 10)].fill(f64::NAN)),
-    here("infinite", "VALUE-001", |w, s| w.episodes[SICK].action[1][90..90 + up_to(s, 10)].fill(f64::INFINITY)),
+    here("infinite", "VALUE-001", |w, s| {
+        w.episodes[SICK].action[1][90..90 + up_to(s, 10)].fill(f64::INFINITY)
+    }),
     here("stuck signal", "VALUE-003", |w, s| {
         let level = w.episodes[SICK].state[1][80];
         w.episodes[SICK].state[1][80..80 + 10 + up_to(s, 60)].fill(level);
@@ -165,7 +209,8 @@ pub(super) const DEFECTS: &[Defect] = &[
     here("wrapped angle declared linear", "VALUE-007", |w, s| {
         let pi = std::f64::consts::PI;
         let n = w.episodes[SICK].n_rows();
-        let turn = move |t: usize| (0.5 + t as f64 / n as f64 * (4.0 + 10.0 * s) + pi).rem_euclid(2.0 * pi) - pi;
+        let turn =
+            move |t: usize| (0.5 + t as f64 / n as f64 * (4.0 + 10.0 * s) + pi).rem_euclid(2.0 * pi) - pi;
         w.episodes[SICK].state[4] = (0..n).map(turn).collect();
     }),
     here("quaternion of wrong length", "VALUE-008", |w, s| {
@@ -176,8 +221,12 @@ pub(super) const DEFECTS: &[Defect] = &[
         let to = from + up_to(s, 60);
         w.episodes[SICK].state[10..14].iter_mut().for_each(|d| d[from..to].iter_mut().for_each(|v| *v = -*v));
     }),
-    here("sine and cosine apart", "VALUE-010", |w, s| w.episodes[SICK].heading[0][60..60 + up_to(s, 100)].iter_mut().for_each(|v| *v *= 1.0 + 0.3 * s)),
-    here("6-D rotation not orthonormal", "VALUE-011", |w, s| w.episodes[SICK].six[3][60..60 + up_to(s, 100)].iter_mut().for_each(|v| *v += 0.2 * s)),
+    here("sine and cosine apart", "VALUE-010", |w, s| {
+        w.episodes[SICK].heading[0][60..60 + up_to(s, 100)].iter_mut().for_each(|v| *v *= 1.0 + 0.3 * s)
+    }),
+    here("6-D rotation not orthonormal", "VALUE-011", |w, s| {
+        w.episodes[SICK].six[3][60..60 + up_to(s, 100)].iter_mut().for_each(|v| *v += 0.2 * s)
+    }),
     here("episode on another scale", "VALUE-013", |w, s| {
         let factor = 1000f64.powf(s);
         w.episodes[SICK].state[..10].iter_mut().flatten().for_each(|v| *v *= factor);
@@ -188,7 +237,9 @@ pub(super) const DEFECTS: &[Defect] = &[
     }),
     here("readings of zero", "VALUE-018", |w, s| {
         let mut rows: Vec<usize> = (20..180).collect();
-        rows.sort_by(|a, b| w.episodes[SICK].state[0][*b].abs().total_cmp(&w.episodes[SICK].state[0][*a].abs()));
+        rows.sort_by(|a, b| {
+            w.episodes[SICK].state[0][*b].abs().total_cmp(&w.episodes[SICK].state[0][*a].abs())
+        });
         rows.into_iter().step_by(9).take(up_to(s, 6)).for_each(|t| w.episodes[SICK].state[0][t] = 0.0);
     }),
     here("shifted actions", "SEMANTIC-001", |w, s| {
@@ -211,7 +262,9 @@ pub(super) const DEFECTS: &[Defect] = &[
         let n = if s < 0.5 { 4 } else { JOINTS };
         w.episodes[SICK].action[..n].iter_mut().for_each(|d| to_steps(d));
     }),
-    here("dead signal", "SEMANTIC-004", |w, s| w.episodes[SICK].state[..up_to(s, 4)].iter_mut().for_each(|d| d.fill(0.25))),
+    here("dead signal", "SEMANTIC-004", |w, s| {
+        w.episodes[SICK].state[..up_to(s, 4)].iter_mut().for_each(|d| d.fill(0.25))
+    }),
     here("actions of another episode", "SEMANTIC-005", |w, s| {
         let n = w.episodes[SICK].n_rows();
         let other = w.episodes[5].action.clone();
@@ -220,17 +273,28 @@ pub(super) const DEFECTS: &[Defect] = &[
             (kept..n).for_each(|t| mine[t] = theirs[t % theirs.len()]);
         }
     }),
-    here("opposite sign", "SEMANTIC-007", |w, s| w.episodes[SICK].action[..up_to(s, 3)].iter_mut().flatten().for_each(|v| *v = -*v)),
+    here("opposite sign", "SEMANTIC-007", |w, s| {
+        w.episodes[SICK].action[..up_to(s, 3)].iter_mut().flatten().for_each(|v| *v = -*v)
+    }),
     here("actions on another scale", "SEMANTIC-008", |w, s| {
         w.episodes[SICK].action[..up_to(s, 4)].iter_mut().flatten().for_each(|v| *v = v.to_degrees());
     }),
-    here("joint zero moved", "SEMANTIC-014", |w, s| w.episodes[SICK].state[3].iter_mut().for_each(|v| *v += 0.8 * s)),
-    whole("task without text", "SEMANTIC-006", |w, s| w.tasks[1] = if s < 0.5 { "task 2" } else { "" }.to_owned()),
+    here("joint zero moved", "SEMANTIC-014", |w, s| {
+        w.episodes[SICK].state[3].iter_mut().for_each(|v| *v += 0.8 * s)
+    }),
+    whole("task without text", "SEMANTIC-006", |w, s| {
+        w.tasks[1] = if s < 0.5 { "task 2" } else { "" }.to_owned()
+    }),
     whole("few windows survive", "SEMANTIC-013", |w, s| {
         let step = if s < 0.5 { 28 } else { 12 };
         w.episodes.iter_mut().for_each(|e| e.state[0].iter_mut().step_by(step).for_each(|v| *v = f64::NAN));
     }),
-    Defect { name: "episode twice", code: "SPLIT-001", episode: Some(5), plant: |w, _| copy_motion(w, SICK, 5) },
+    Defect {
+        name: "episode twice",
+        code: "SPLIT-001",
+        episode: Some(5),
+        plant: |w, _| copy_motion(w, SICK, 5),
+    },
     Defect {
         name: "episode nearly twice",
         code: "SPLIT-002",
@@ -246,8 +310,15 @@ pub(super) const DEFECTS: &[Defect] = &[
         let n = up_to(s, 3);
         (0..n).for_each(|k| w.episodes[7 - k].session = "session-1".to_owned());
     }),
-    whole("split beyond the end", "SPLIT-004", |w, s| w.folder.splits = Some(format!("0:{}", w.episodes.len() + up_to(s, 50)))),
-    Defect { name: "copy on the other side", code: "SPLIT-006", episode: Some(7), plant: |w, _| copy_motion(w, SICK, 7) },
+    whole("split beyond the end", "SPLIT-004", |w, s| {
+        w.folder.splits = Some(format!("0:{}", w.episodes.len() + up_to(s, 50)))
+    }),
+    Defect {
+        name: "copy on the other side",
+        code: "SPLIT-006",
+        episode: Some(7),
+        plant: |w, _| copy_motion(w, SICK, 7),
+    },
     Defect {
         name: "copies with different labels",
         code: "SPLIT-007",
@@ -267,7 +338,9 @@ pub(super) const DEFECTS: &[Defect] = &[
             let source = w.episodes[SICK].clone();
             let start = source.n_rows() - shared;
             let copy = |to: &mut Vec<Vec<f64>>, from: &Vec<Vec<f64>>| {
-                to.iter_mut().zip(from).for_each(|(a, b)| a[..shared].copy_from_slice(&b[start..start + shared]));
+                to.iter_mut()
+                    .zip(from)
+                    .for_each(|(a, b)| a[..shared].copy_from_slice(&b[start..start + shared]));
             };
             copy(&mut w.episodes[5].state, &source.state);
             copy(&mut w.episodes[5].action, &source.action);

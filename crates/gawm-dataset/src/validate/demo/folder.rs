@@ -4,7 +4,8 @@ use std::{collections::HashMap, fs, io, path::Path, sync::Arc};
 
 use arrow::{
     array::{
-        ArrayRef, BinaryArray, BooleanArray, Float32Array, Int64Array, ListArray, RecordBatch, StringArray, StructArray,
+        ArrayRef, BinaryArray, BooleanArray, Float32Array, Int64Array, ListArray, RecordBatch, StringArray,
+        StructArray,
     },
     buffer::{NullBuffer, OffsetBuffer},
     datatypes::{DataType, Field, Fields, Schema},
@@ -38,12 +39,17 @@ pub(super) fn write(world: &World, dir: &Path) -> io::Result<()> {
     if !world.folder.without_pandas {
         metadata.insert("pandas".to_owned(), PANDAS.to_owned());
     }
-    let fields = vec![Field::new("task_index", DataType::Int64, false), Field::new("task", DataType::Utf8, false)];
+    let fields =
+        vec![Field::new("task_index", DataType::Int64, false), Field::new("task", DataType::Utf8, false)];
     let schema = Schema::new_with_metadata(fields, metadata);
-    let columns: Vec<ArrayRef> = vec![Arc::new(Int64Array::from_iter_values(0..world.tasks.len() as i64)), Arc::new(texts)];
+    let columns: Vec<ArrayRef> =
+        vec![Arc::new(Int64Array::from_iter_values(0..world.tasks.len() as i64)), Arc::new(texts)];
     write_parquet(&dir.join("meta/tasks.parquet"), &batch(schema, columns)?)?;
     let stats = serde_json::to_string_pretty(&stats(world)).map_err(io::Error::other)?;
-    fs::write(dir.join("meta/stats.json"), if world.folder.garbled_meta { stats.replace("0.", "NaN,") } else { stats })?;
+    fs::write(
+        dir.join("meta/stats.json"),
+        if world.folder.garbled_meta { stats.replace("0.", "NaN,") } else { stats },
+    )?;
     let info = serde_json::to_string_pretty(&info(world)).map_err(io::Error::other)?;
     fs::write(dir.join("meta/info.json"), info)
 }
@@ -78,9 +84,15 @@ fn rows(world: &World) -> io::Result<RecordBatch> {
             global += 1;
         }
     }
-    columns.push(("timestamp".into(), floats(episodes().flat_map(|(_, e)| e.timestamp.iter().map(|v| *v as f32)).collect())));
+    columns.push((
+        "timestamp".into(),
+        floats(episodes().flat_map(|(_, e)| e.timestamp.iter().map(|v| *v as f32)).collect()),
+    ));
     columns.push(("frame_index".into(), ints(episodes().flat_map(|(_, e)| e.frame_index.clone()).collect())));
-    columns.push(("episode_index".into(), ints(episodes().flat_map(|(i, e)| vec![i as i64; e.n_rows()]).collect())));
+    columns.push((
+        "episode_index".into(),
+        ints(episodes().flat_map(|(i, e)| vec![i as i64; e.n_rows()]).collect()),
+    ));
     columns.push(("index".into(), ints(index)));
     columns.push(("task_index".into(), ints(episodes().flat_map(|(_, e)| e.task_index.clone()).collect())));
     columns.push(("gawm.time_ns".into(), ints(episodes().flat_map(|(_, e)| e.time_ns.clone()).collect())));
@@ -106,7 +118,8 @@ fn rows(world: &World) -> io::Result<RecordBatch> {
     }
     if world.episodes.iter().all(|e| !e.frames.is_empty()) {
         for (camera, name) in CAMERAS.iter().enumerate() {
-            let frames: Vec<Option<&[u8]>> = episodes().flat_map(|(_, e)| e.frames[camera].iter().map(|f| f.as_deref())).collect();
+            let frames: Vec<Option<&[u8]>> =
+                episodes().flat_map(|(_, e)| e.frames[camera].iter().map(|f| f.as_deref())).collect();
             columns.push(((*name).to_owned(), image_array(frames)));
         }
     }
@@ -115,7 +128,8 @@ fn rows(world: &World) -> io::Result<RecordBatch> {
         columns.push((name.to_owned(), floats(vec![0.5; n])));
     }
     columns.retain(|(name, _)| Some(name.as_str()) != world.folder.dropped_column);
-    let fields: Vec<Field> = columns.iter().map(|(n, a)| Field::new(n, a.data_type().clone(), true)).collect();
+    let fields: Vec<Field> =
+        columns.iter().map(|(n, a)| Field::new(n, a.data_type().clone(), true)).collect();
     batch(Schema::new(fields), columns.into_iter().map(|(_, a)| a).collect())
 }
 
@@ -137,7 +151,12 @@ impl Lists {
     fn finish(self) -> ArrayRef {
         let field = Arc::new(Field::new_list_field(DataType::Float32, true));
         let nulls = self.valid.contains(&false).then(|| NullBuffer::from(self.valid));
-        Arc::new(ListArray::new(field, OffsetBuffer::from_lengths(self.lengths), Arc::new(Float32Array::from(self.values)), nulls))
+        Arc::new(ListArray::new(
+            field,
+            OffsetBuffer::from_lengths(self.lengths),
+            Arc::new(Float32Array::from(self.values)),
+            nulls,
+        ))
     }
 }
 
@@ -145,7 +164,10 @@ fn image_array(frames: Vec<Option<&[u8]>>) -> ArrayRef {
     let n = frames.len();
     let bytes: ArrayRef = Arc::new(BinaryArray::from(frames));
     let path: ArrayRef = Arc::new(StringArray::new_null(n));
-    let fields = Fields::from(vec![Field::new("bytes", DataType::Binary, true), Field::new("path", DataType::Utf8, true)]);
+    let fields = Fields::from(vec![
+        Field::new("bytes", DataType::Binary, true),
+        Field::new("path", DataType::Utf8, true),
+    ]);
     Arc::new(StructArray::new(fields, vec![bytes, path], None))
 }
 
@@ -159,7 +181,8 @@ fn episode_table(world: &World) -> io::Result<RecordBatch> {
     let extra = |i: usize| world.folder.extra_length.iter().find(|(e, _)| *e == i).map_or(0, |(_, n)| *n);
     let n = world.episodes.len();
     let ints = |f: &dyn Fn(usize) -> i64| Arc::new(Int64Array::from_iter_values((0..n).map(f))) as ArrayRef;
-    let texts = |f: &dyn Fn(usize) -> String| Arc::new(StringArray::from_iter_values((0..n).map(f))) as ArrayRef;
+    let texts =
+        |f: &dyn Fn(usize) -> String| Arc::new(StringArray::from_iter_values((0..n).map(f))) as ArrayRef;
     let length = |i: usize| world.episodes[i].n_rows() as i64 + extra(i);
     let task = |i: usize| {
         let index = world.episodes[i].task_index.first().copied().unwrap_or(0) as usize;
@@ -171,7 +194,8 @@ fn episode_table(world: &World) -> io::Result<RecordBatch> {
         texts(&task),
         None,
     );
-    let success: ArrayRef = Arc::new(BooleanArray::from(world.episodes.iter().map(|e| e.success).collect::<Vec<_>>()));
+    let success: ArrayRef =
+        Arc::new(BooleanArray::from(world.episodes.iter().map(|e| e.success).collect::<Vec<_>>()));
     let columns: Vec<(&str, ArrayRef)> = vec![
         ("episode_index", ints(&|i| i as i64)),
         ("tasks", Arc::new(tasks)),
@@ -184,24 +208,42 @@ fn episode_table(world: &World) -> io::Result<RecordBatch> {
         ("session", texts(&|i| world.episodes[i].session.clone())),
         ("split", texts(&|i| world.episodes[i].split.clone())),
     ];
-    let fields: Vec<Field> = columns.iter().map(|(n, a)| Field::new(*n, a.data_type().clone(), true)).collect();
+    let fields: Vec<Field> =
+        columns.iter().map(|(n, a)| Field::new(*n, a.data_type().clone(), true)).collect();
     batch(Schema::new(fields), columns.into_iter().map(|(_, a)| a).collect())
 }
 
 fn info(world: &World) -> Value {
     let mut features = serde_json::Map::new();
     let mut add = |name: &str, dtype: &str, shape: Value, names: Value, units: Value| {
-        features.insert(name.to_owned(), json!({"dtype": dtype, "shape": shape, "names": names, "units": units}));
+        features
+            .insert(name.to_owned(), json!({"dtype": dtype, "shape": shape, "names": names, "units": units}));
     };
     add("timestamp", "float32", json!([1]), Value::Null, Value::Null);
     for name in ["frame_index", "episode_index", "index", "task_index", "gawm.time_ns"] {
         add(name, "int64", json!([1]), Value::Null, Value::Null);
     }
     let units = |n: usize| -> Value {
-        (0..n).map(|i| if i < JOINTS { "rad" } else if (7..10).contains(&i) { "m" } else { "1" }).collect()
+        (0..n)
+            .map(|i| {
+                if i < JOINTS {
+                    "rad"
+                } else if (7..10).contains(&i) {
+                    "m"
+                } else {
+                    "1"
+                }
+            })
+            .collect()
     };
     let dtype = world.folder.action_dtype.unwrap_or("float32");
-    add("observation.state", "float32", json!([STATE_NAMES.len()]), json!(STATE_NAMES), units(STATE_NAMES.len()));
+    add(
+        "observation.state",
+        "float32",
+        json!([STATE_NAMES.len()]),
+        json!(STATE_NAMES),
+        units(STATE_NAMES.len()),
+    );
     add("action", dtype, json!([JOINTS + 1]), json!(STATE_NAMES[..=JOINTS]), units(JOINTS + 1));
     add("observation.heading", "float32", json!([2]), json!(["heading_sin", "heading_cos"]), Value::Null);
     let six: Vec<String> = (0..6).map(|i| format!("tool_6d_{i}")).collect();
@@ -228,7 +270,14 @@ fn info(world: &World) -> Value {
 fn stats(world: &World) -> Value {
     let of = |dims: fn(&super::world::Episode) -> &Vec<Vec<f64>>| {
         let width = dims(&world.episodes[0]).len();
-        let column = |d: usize| world.episodes.iter().flat_map(move |e| dims(e)[d].iter().copied()).filter(|v| v.is_finite()).collect::<Vec<f64>>();
+        let column = |d: usize| {
+            world
+                .episodes
+                .iter()
+                .flat_map(move |e| dims(e)[d].iter().copied())
+                .filter(|v| v.is_finite())
+                .collect::<Vec<f64>>()
+        };
         let columns: Vec<Vec<f64>> = (0..width).map(column).collect();
         let mean = |c: &Vec<f64>| c.iter().sum::<f64>() / c.len().max(1) as f64 + world.folder.stats_shift;
         let min = |c: &Vec<f64>| c.iter().copied().fold(f64::INFINITY, f64::min);

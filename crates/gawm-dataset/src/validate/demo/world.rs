@@ -89,7 +89,14 @@ impl Episode {
         fn cut<T>(values: &mut Vec<T>, from: usize, to: usize) {
             values.drain(from..to);
         }
-        let groups = [&mut self.state, &mut self.action, &mut self.heading, &mut self.six, &mut self.age_ms, &mut self.arrival_age_ms];
+        let groups = [
+            &mut self.state,
+            &mut self.action,
+            &mut self.heading,
+            &mut self.six,
+            &mut self.age_ms,
+            &mut self.arrival_age_ms,
+        ];
         groups.into_iter().flatten().for_each(|dim| cut(dim, from, to));
         self.frames.iter_mut().for_each(|camera| cut(camera, from, to));
         let n = self.n_rows() - (to - from);
@@ -130,7 +137,8 @@ pub(super) struct Folder {
 pub(super) fn clean_world(seed: u64, has_cameras: bool) -> World {
     let mut random = Random(seed.wrapping_mul(0x5851_f42d_4c95_7f2d) ^ 0x1405_7b7e_f767_814f);
     let episodes = (0..8).map(|i| episode(&mut random, i, has_cameras)).collect();
-    let tasks = vec!["put the red cube on the blue plate".to_owned(), "open the upper drawer of the desk".to_owned()];
+    let tasks =
+        vec!["put the red cube on the blue plate".to_owned(), "open the upper drawer of the desk".to_owned()];
     World { episodes, tasks, folder: Folder::default() }
 }
 
@@ -160,15 +168,25 @@ fn episode(random: &mut Random, number: usize, has_cameras: bool) -> Episode {
     let six = six_dims(&state, n);
     let age: Vec<f64> = (0..n).map(|_| 4.0 + 8.0 * random.uniform()).collect();
     let camera_age: Vec<f64> = (0..n).map(|_| 10.0 + 20.0 * random.uniform()).collect();
-    let delay = |ages: &Vec<f64>, random: &mut Random, ms: f64| -> Vec<f64> { ages.iter().map(|a| a - ms + 0.4 * random.normal()).collect() };
+    let delay = |ages: &Vec<f64>, random: &mut Random, ms: f64| -> Vec<f64> {
+        ages.iter().map(|a| a - ms + 0.4 * random.normal()).collect()
+    };
     let arrival_age_ms = vec![delay(&age, random, 1.0), delay(&camera_age, random, 6.0)];
-    let frames = if has_cameras { (0..2).map(|c| (0..n).map(|t| Some(frame(c, &state, t, random))).collect()).collect() } else { Vec::new() };
+    let frames = if has_cameras {
+        (0..2).map(|c| (0..n).map(|t| Some(frame(c, &state, t, random))).collect()).collect()
+    } else {
+        Vec::new()
+    };
     Episode {
         timestamp: (0..n).map(|t| t as f64 / FPS).collect(),
         frame_index: (0..n as i64).collect(),
         index_shift: vec![0; n],
         task_index: vec![(number % 2) as i64; n],
-        time_ns: (0..n).map(|t| 1_700_000_000_000_000_000 + number as i64 * 60_000_000_000 + (t as f64 / FPS * 1e9) as i64).collect(),
+        time_ns: (0..n)
+            .map(|t| {
+                1_700_000_000_000_000_000 + number as i64 * 60_000_000_000 + (t as f64 / FPS * 1e9) as i64
+            })
+            .collect(),
         age_ms: vec![age, camera_age],
         arrival_age_ms,
         frames,
@@ -188,10 +206,18 @@ fn episode(random: &mut Random, number: usize, has_cameras: bool) -> Episode {
 fn target(random: &mut Random, n: usize) -> Vec<f64> {
     let waves: Vec<(f64, f64, f64)> = [(0.5, 0.2), (0.25, 0.5), (0.12, 1.1)]
         .into_iter()
-        .map(|(size, hz)| (size * (0.7 + 0.6 * random.uniform()), hz * (0.7 + 0.6 * random.uniform()), TAU * random.uniform()))
+        .map(|(size, hz)| {
+            (
+                size * (0.7 + 0.6 * random.uniform()),
+                hz * (0.7 + 0.6 * random.uniform()),
+                TAU * random.uniform(),
+            )
+        })
         .collect();
     let centre = 0.6 * (random.uniform() - 0.5);
-    let at = |t: usize| waves.iter().map(|(size, hz, phase)| size * (TAU * hz * t as f64 / FPS + phase).sin()).sum::<f64>();
+    let at = |t: usize| {
+        waves.iter().map(|(size, hz, phase)| size * (TAU * hz * t as f64 / FPS + phase).sin()).sum::<f64>()
+    };
     (0..n).map(|t| centre + at(t) + 2e-4 * random.normal()).collect()
 }
 
@@ -217,7 +243,8 @@ fn six_dims(state: &[Vec<f64>], n: usize) -> Vec<Vec<f64>> {
 }
 
 fn frame(camera: usize, state: &[Vec<f64>], t: usize, random: &mut Random) -> Bytes {
-    let (cx, cy) = (FRAME_SIDE as f64 * (0.5 + 0.3 * state[0][t]), FRAME_SIDE as f64 * (0.5 + 0.3 * state[1][t]));
+    let (cx, cy) =
+        (FRAME_SIDE as f64 * (0.5 + 0.3 * state[0][t]), FRAME_SIDE as f64 * (0.5 + 0.3 * state[1][t]));
     let mut rgb = Vec::with_capacity(FRAME_SIDE * FRAME_SIDE * 3);
     for y in 0..FRAME_SIDE {
         for x in 0..FRAME_SIDE {
