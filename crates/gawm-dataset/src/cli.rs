@@ -1,5 +1,8 @@
 //! The command line of `gawm-data`.
 
+mod diff;
+mod report;
+mod standardize;
 mod stats;
 mod validate;
 
@@ -28,6 +31,9 @@ pub struct Arguments {
 enum Verb {
     Validate(validate::ValidateArguments),
     Stats(stats::StatsArguments),
+    Report(report::ReportArguments),
+    Diff(diff::DiffArguments),
+    Standardize(standardize::StandardizeArguments),
 }
 
 /// Runs the program and returns its exit code.
@@ -48,6 +54,9 @@ pub fn run(arguments: impl IntoIterator<Item = std::ffi::OsString>) -> ExitCode 
     let outcome = match &arguments.verb {
         Verb::Validate(verb) => validate::run(verb, arguments.quiet),
         Verb::Stats(verb) => stats::run(verb),
+        Verb::Report(verb) => report::run(verb),
+        Verb::Diff(verb) => diff::run(verb),
+        Verb::Standardize(verb) => standardize::run(verb),
     };
     match outcome {
         Ok(code) => ExitCode::from(code),

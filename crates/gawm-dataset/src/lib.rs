@@ -16,6 +16,7 @@ pub mod layout;
 mod picture;
 mod provenance;
 pub mod read;
+pub mod report;
 mod rows;
 mod scan;
 mod spec;

@@ -4,6 +4,7 @@
 //! [`gawm_schema::QuantileSketch`]). Raw columns and the encoded ones (`gawm.state`, `gawm.action`) are treated alike.
 
 mod camera;
+mod difference;
 mod motion;
 mod render;
 
@@ -14,6 +15,7 @@ use gawm_schema::{DimStats, DimSummary};
 use serde::Serialize;
 
 pub use camera::{CameraSummary, camera_summaries};
+pub use difference::{Difference, DimDifference, difference};
 pub use motion::{MotionStats, MotionSummary};
 pub use render::{lerobot_stats, render_text};
 

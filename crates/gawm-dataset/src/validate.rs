@@ -58,11 +58,56 @@ impl Default for ValidateOptions {
     }
 }
 
+/// A validation with the measures that reports show beside the findings.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Examination {
+    /// The findings.
+    pub report: Report,
+    /// The runs of rows in order.
+    pub episodes: Vec<EpisodeMeasures>,
+    /// How many rows before the motion an action lies, if actions and states can be compared.
+    pub action_lag: Option<ActionLag>,
+}
+
+/// Measures of one episode.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EpisodeMeasures {
+    /// Episode index.
+    pub episode: i64,
+    /// Number of rows.
+    pub rows: usize,
+    /// Median rate.
+    pub rate_hz: f64,
+    /// Longest step between rows, in periods.
+    pub longest_periods: f64,
+    /// 95th percentile of jitter, in periods.
+    pub jitter_periods: f64,
+    /// Share of idle rows.
+    pub idle_share: f64,
+}
+
+/// How states follow actions.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ActionLag {
+    /// The motion from t to t+1 is explained best by the action of row t minus this.
+    pub rows: i64,
+    /// Share of the unsteady motion that the action explains there.
+    pub explained: f64,
+}
+
 /// Validates a dataset.
 ///
 /// # Errors
 /// An episode is too long to be held at once.
 pub fn validate(dataset: &Dataset, options: &ValidateOptions) -> Result<Report, ScanError> {
+    examine(dataset, options).map(|examination| examination.report)
+}
+
+/// Validates a dataset and returns what reports show beside the findings.
+///
+/// # Errors
+/// An episode is too long to be held at once.
+pub fn examine(dataset: &Dataset, options: &ValidateOptions) -> Result<Examination, ScanError> {
     let thresholds = &options.thresholds;
     let layouts = layout::layouts(dataset);
     let has_images = options.checks_images && dataset.info.features.iter().any(|f| f.dtype == DType::Image);
@@ -86,7 +131,19 @@ pub fn validate(dataset: &Dataset, options: &ValidateOptions) -> Result<Report, 
         findings.extend(image::judge_videos(dataset));
     }
     let windows = window_yield(dataset, options, &runs, &mut findings);
-    Ok(report(dataset, thresholds, windows, findings))
+    let measures = |run: &profile::RunProfile| EpisodeMeasures {
+        episode: run.episode,
+        rows: run.n_rows,
+        rate_hz: run.time.rate_hz,
+        longest_periods: run.time.longest_periods,
+        jitter_periods: run.time.jitter_periods,
+        idle_share: run.motion.idle_share,
+    };
+    Ok(Examination {
+        episodes: runs.iter().map(measures).collect(),
+        action_lag: semantic::action_lag(&runs),
+        report: report(dataset, thresholds, windows, findings),
+    })
 }
 
 fn window_yield(

@@ -37,6 +37,21 @@ pub(super) fn judge(
     findings
 }
 
+/// Returns the shift of the action that explains the motion best, over all runs.
+pub(super) fn action_lag(runs: &[RunProfile]) -> Option<super::ActionLag> {
+    let profiles: Vec<&[f64; SHIFTS]> =
+        runs.iter().filter_map(|r| r.tracking.as_ref().and_then(|t| t.profile.as_ref())).collect();
+    if profiles.is_empty() {
+        return None;
+    }
+    let mut typical = [0.0; SHIFTS];
+    for (k, value) in typical.iter_mut().enumerate() {
+        *value = median(&profiles.iter().map(|p| p[k]).collect::<Vec<_>>());
+    }
+    let k = best(&typical);
+    Some(super::ActionLag { rows: NO_SHIFT as i64 - k as i64, explained: 1.0 - typical[k].exp() })
+}
+
 struct Judge<'a> {
     plan: &'a Plan,
     thresholds: &'a Thresholds,
@@ -49,6 +64,18 @@ fn best(profile: &[f64; SHIFTS]) -> usize {
     (0..SHIFTS)
         .min_by(|a, b| profile[*a].total_cmp(&profile[*b]).then(order(a).cmp(&order(b))))
         .unwrap_or(NO_SHIFT)
+}
+
+/// Returns by how many rows `profile` is the typical one moved, if that fits clearly better than not moved.
+fn moved_by(profile: &[f64; SHIFTS], typical: &[f64; SHIFTS]) -> Option<i64> {
+    const MOST: i64 = 4;
+    let error = |by: i64| {
+        let inside = |k: i64| (0..SHIFTS as i64).contains(&(k + by)).then(|| profile[(k + by) as usize] - typical[k as usize]);
+        let gaps: Vec<f64> = (0..SHIFTS as i64).filter_map(inside).collect();
+        gaps.iter().map(|g| g * g).sum::<f64>() / gaps.len() as f64
+    };
+    let by = (-MOST..=MOST).min_by(|a, b| error(*a).total_cmp(&error(*b)).then(a.abs().cmp(&b.abs())))?;
+    (by != 0 && error(0) > 4.0 * error(by) + 0.01).then_some(by)
 }
 
 impl Judge<'_> {
@@ -73,23 +100,15 @@ impl Judge<'_> {
         }
         let usual = best(&typical);
         let margin = -self.thresholds.semantic.shift_residual_ratio.ln();
-        let agreeing = profiles.iter().filter(|(_, p)| best(p).abs_diff(usual) <= 1).count();
-        let is_agreed = profiles.len() >= MIN_RUNS && agreeing as f64 >= 0.6 * profiles.len() as f64;
         self.shift_of_all(&typical, usual, margin, findings);
-        if !is_agreed || typical[usual] > -0.1 {
+        if profiles.len() < MIN_RUNS || typical[usual] > -0.1 {
             return;
         }
         for (run, profile) in profiles {
             let here = best(profile);
-            let gain = profile[usual] - profile[here];
-            if here != usual && gain >= margin && self.is_shifted_copy(profile, &typical, here, usual) {
-                let by = here as i64 - usual as i64;
-                let message = format!(
-                    "the action acts {by:+} rows from where it does in the other episodes; residuals fall to {:.0} %",
-                    100.0 * (-gain).exp()
-                );
-                let finding =
-                    Finding::new("SEMANTIC-001", message).episode(run.episode).feature(self.action_feature());
+            if let Some(by) = moved_by(profile, &typical) {
+                let message = format!("the action acts {by:+} rows from where it does in the other episodes");
+                let finding = Finding::new("SEMANTIC-001", message).episode(run.episode).feature(self.action_feature());
                 findings.push(finding.rows(0, run.n_rows).measured(by as f64, 0.0));
             } else if profile[here] > 0.2 * typical[usual] && typical[usual] < -0.5 {
                 let message = format!(
@@ -97,34 +116,19 @@ impl Judge<'_> {
                     100.0 * (1.0 - profile[here].exp()),
                     100.0 * (1.0 - typical[usual].exp())
                 );
-                let finding =
-                    Finding::new("SEMANTIC-005", message).episode(run.episode).feature(self.action_feature());
-                findings.push(
-                    finding
-                        .rows(0, run.n_rows)
-                        .measured(1.0 - profile[here].exp(), 1.0 - (0.2 * typical[usual]).exp()),
-                );
+                let finding = Finding::new("SEMANTIC-005", message).episode(run.episode).feature(self.action_feature());
+                let bound = 1.0 - (0.2 * typical[usual]).exp();
+                findings.push(finding.rows(0, run.n_rows).measured(1.0 - profile[here].exp(), bound));
             }
         }
-    }
-
-    /// Returns whether the profile looks like the typical one moved by the difference of their best shifts.
-    fn is_shifted_copy(
-        &self,
-        profile: &[f64; SHIFTS],
-        typical: &[f64; SHIFTS],
-        here: usize,
-        usual: usize,
-    ) -> bool {
-        // The best value must be as deep as it is elsewhere, at least half-way.
-        let depth = profile[here] / typical[usual].min(-1e-9);
-        depth > 0.5 || here.abs_diff(usual) >= 2 && depth > 0.3
     }
 
     /// Judges the shift that all episodes share.
     fn shift_of_all(&self, typical: &[f64; SHIFTS], usual: usize, margin: f64, findings: &mut Vec<Finding>) {
         let is_better = typical[NO_SHIFT] - typical[usual] >= margin;
-        if usual > NO_SHIFT && is_better {
+        // Smooth commands explain motion before they are given; one that acts at row t explains it at row t as well.
+        let is_late = typical[NO_SHIFT] > 0.35 * typical[usual];
+        if usual > NO_SHIFT && is_better && is_late {
             let by = usual - NO_SHIFT;
             let message = format!(
                 "the motion from t to t+1 is explained best by the action of row t+{by}: actions are recorded {by} rows late"
@@ -374,7 +378,8 @@ impl Judge<'_> {
         }
         for (run, (_, ratio)) in verdicts.iter().filter(|_| verdicts.len() >= MIN_RUNS) {
             let relative = ratio / usual;
-            if !(0.2..=5.0).contains(&relative) && quantile(&ratios, 0.75) / quantile(&ratios, 0.25) < 2.0 {
+            let agreeing = ratios.iter().filter(|r| (0.5..2.0).contains(&(**r / usual))).count();
+            if !(0.2..=5.0).contains(&relative) && agreeing as f64 >= 0.6 * ratios.len() as f64 {
                 let message = format!(
                     "the action is {ratio:.3} times its state, in the other episodes {usual:.3} times{}",
                     known_factor(relative)
@@ -387,7 +392,7 @@ impl Judge<'_> {
     }
 
     fn offsets(&self, findings: &mut Vec<Finding>) {
-        if self.tracked.len() < MIN_RUNS + 1 {
+        if self.tracked.len() < MIN_RUNS {
             return;
         }
         for (pair, (_, s)) in self.plan.pairs.iter().enumerate() {

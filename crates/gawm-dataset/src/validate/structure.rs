@@ -85,7 +85,7 @@ pub(super) fn judge_stats(dataset: &Dataset, plan: &Plan, runs: &[RunProfile]) -
             if n == 0.0 {
                 continue;
             }
-            let scale = (high - low).max(1e-4 * high.abs().max(low.abs())).max(1e-9);
+            let scale = (high - low).max(1e-3 * high.abs().max(low.abs())).max(1e-9);
             let worst = [(mean, sum / n, "mean"), (min, low, "min"), (max, high, "max")]
                 .into_iter()
                 .map(|(stored, actual, name)| ((stored - actual).abs() / scale, stored, actual, name))

@@ -112,7 +112,7 @@ thresholds! {
         /// Ratio of an episode's scale to the others' (VALUE-013).
         scale_ratio: 8.0,
         /// Ratio of the noise in an interval to the usual (VALUE-015).
-        noise_ratio: 8.0,
+        noise_ratio: 6.0,
         /// Distance of an episode's mean from the others, in their robust standard deviations (VALUE-016).
         offset_sigmas: 12.0,
     }
@@ -121,7 +121,7 @@ thresholds! {
 thresholds! {
     /// Bounds of the rules in group SEMANTIC.
     SemanticThresholds {
-        /// How much better another shift must explain the motion, as a ratio of residuals (SEMANTIC-001).
+        /// How much better another shift must explain the motion of all episodes, as a ratio of residuals (SEMANTIC-001).
         shift_residual_ratio: 0.8,
         /// How much better another joint must correlate (SEMANTIC-002).
         permuted_margin: 0.3,

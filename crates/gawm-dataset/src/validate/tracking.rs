@@ -10,6 +10,8 @@ pub(super) const NO_SHIFT: usize = SHIFTS / 2;
 const SAMPLE_ROWS: usize = 768;
 /// Rows of the matrices of all dims against all.
 const MATRIX_ROWS: usize = 256;
+/// Share of the largest spread below which a dim is at rest and says nothing of timing.
+const IDLE_SHARE: f64 = 0.05;
 /// Rows of a smoothed step.
 const SMOOTH_ROWS: usize = 5;
 
@@ -54,7 +56,10 @@ pub(super) fn track(
     }
     let profiles: Vec<PairProfile> =
         pairs.iter().map(|(a, s)| pair_profile(actions[*a], states[*s])).collect();
-    let moving: Vec<&[f64; SHIFTS]> = profiles.iter().filter_map(|p| p.residuals.as_ref()).collect();
+    let spreads: Vec<f64> = pairs.iter().map(|(_, s)| variance(states[*s]).sqrt()).collect();
+    let idle = IDLE_SHARE * spreads.iter().copied().fold(0.0, f64::max);
+    let moving: Vec<&[f64; SHIFTS]> =
+        profiles.iter().zip(&spreads).filter(|(_, spread)| **spread > idle).filter_map(|(p, _)| p.residuals.as_ref()).collect();
     let profile = (!moving.is_empty()).then(|| {
         let mut mean = [0.0; SHIFTS];
         for residuals in &moving {

@@ -132,7 +132,7 @@ impl Judge<'_> {
 
     fn constant_here(&self, dim: usize, moving: usize, findings: &mut Vec<Finding>) {
         let n_runs = self.profiles.len();
-        if n_runs < MIN_RUNS || (moving as f64) < 0.75 * n_runs as f64 {
+        if n_runs < 3 || (moving as f64) < 0.65 * n_runs as f64 {
             return;
         }
         // A joint that hardly moves elsewhere may rest for one episode.
