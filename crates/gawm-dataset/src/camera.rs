@@ -2,8 +2,13 @@
 
 use std::collections::BTreeMap;
 
+use bytes::Bytes;
+use gawm_image::{PixelValues, Pixels, decode_pixels};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::block::RowBlock;
+use crate::columns::Columns;
 use crate::episode::FeatureStats;
 
 /// Counts of pixel values per channel; merging is exact and order does not matter.
@@ -95,4 +100,55 @@ impl PixelStats<'_> {
 /// Returns what a pixel value is multiplied by: colours are given in 0..=1, depth as it is.
 pub(crate) fn pixel_unit(spec: &gawm_schema::ImageSpec) -> f64 {
     if spec.depth { 1.0 } else { 1.0 / 255.0 }
+}
+
+/// Counts the sampled frames of a block whose first row has position `first_frame` in its episode.
+///
+/// Frames that do not belong to their row or cannot be decoded are left out.
+pub(crate) fn count_frames(
+    columns: &Columns,
+    block: &RowBlock,
+    first_frame: u64,
+    cameras: &mut BTreeMap<String, CameraStats>,
+) {
+    let n_vectors = columns.vectors.len();
+    for (position, image) in columns.images.iter().enumerate() {
+        let (frames, valid) = (&block.images[position], &block.valid[n_vectors + position]);
+        let sampled: Vec<&Bytes> = (0..block.len())
+            .filter(|&row| valid[row] && is_sampled(first_frame + row as u64))
+            .map(|row| &frames[row])
+            .collect();
+        let counted: Vec<CameraStats> = sampled
+            .par_iter()
+            .filter_map(|frame| decode_pixels(frame).ok())
+            .map(|p| count_pixels(&p))
+            .collect();
+        let stats = cameras.entry(image.name.clone()).or_default();
+        counted.iter().for_each(|one| stats.merge(one));
+    }
+}
+
+/// Counts every n-th pixel of every n-th row, so that at most about 256 x 256 pixels are looked at.
+fn count_pixels(pixels: &Pixels) -> CameraStats {
+    let step = (pixels.height.max(pixels.width) / 256).max(1);
+    let mut dense = vec![vec![0u64; 1 << 16]; pixels.channels.min(3)];
+    for y in (0..pixels.height).step_by(step) {
+        for x in (0..pixels.width).step_by(step) {
+            let start = (y * pixels.width + x) * pixels.channels;
+            for (channel, counts) in dense.iter_mut().enumerate() {
+                let value = match &pixels.values {
+                    PixelValues::U8(values) => u16::from(values[start + channel]),
+                    PixelValues::U16(values) => values[start + channel],
+                    // Metres as millimetres; NaN and negative values are 0: no measurement.
+                    PixelValues::F32(values) => (values[start + channel] * 1000.0).round() as u16,
+                };
+                counts[usize::from(value)] += 1;
+            }
+        }
+    }
+    let sparse = |counts: Vec<u64>| {
+        let filled = counts.into_iter().enumerate().filter(|(_, count)| *count > 0);
+        filled.map(|(value, count)| (value as u16, count)).collect()
+    };
+    CameraStats { frames: 1, channels: dense.into_iter().map(sparse).collect() }
 }

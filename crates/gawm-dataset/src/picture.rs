@@ -125,8 +125,13 @@ impl Picture {
     /// Encodes the picture as JPEG of middling quality, for embedding.
     pub(crate) fn to_jpeg(&self) -> Result<Vec<u8>, turbojpeg::Error> {
         use turbojpeg::{Image, PixelFormat, Subsamp};
-        let image =
-            Image { pixels: self.rgb.as_slice(), width: self.width, pitch: self.width * 3, height: self.height, format: PixelFormat::RGB };
+        let image = Image {
+            pixels: self.rgb.as_slice(),
+            width: self.width,
+            pitch: self.width * 3,
+            height: self.height,
+            format: PixelFormat::RGB,
+        };
         Ok(turbojpeg::compress(image, 75, Subsamp::Sub2x2)?.to_vec())
     }
 

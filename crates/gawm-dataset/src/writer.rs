@@ -1,5 +1,6 @@
 //! Writes a dataset recording by recording, episode by episode, piece by piece.
 
+mod attachments;
 mod episode_rows;
 mod finish;
 mod open;
@@ -171,6 +172,7 @@ impl DatasetWriter {
             recording.file = Some(create_file(&self.dir, &self.disk, &columns, number)?);
         }
         let Some(file) = recording.file.as_mut() else { return Ok(()) };
+        episode.begin_in(file.mark());
         episode.write(&columns, file, trajectory.into_rows())
     }
 
@@ -206,6 +208,31 @@ impl DatasetWriter {
         self.episodes.push(done.record);
         if file.bytes_written() >= self.spec.max_file_bytes {
             close_file(recording, &self.meta)?;
+        }
+        Ok(())
+    }
+
+    /// Gives up the open episode with all rows written so far, as if it had not begun.
+    ///
+    /// Costs a copy of the data file's earlier episodes when more rows than fit into one block were written.
+    ///
+    /// # Errors
+    /// - no episode is open;
+    /// - the data file cannot be read or written.
+    pub fn discard_episode(&mut self) -> Result<(), WriteError> {
+        let columns = Arc::clone(&self.columns);
+        let recording = open_recording(&mut self.recording, "discard_episode")?;
+        let Some(episode) = recording.episode.take() else {
+            return Err(order("discard_episode", "without an open episode"));
+        };
+        if let (Some(file), Some(mark)) = (recording.file.take(), episode.beginning()) {
+            let path = file.path().to_owned();
+            recording.file = file.rewind(&columns, mark).map_err(WriteError::parquet(&path))?;
+        }
+        // A task that only the discarded episode had is no task of the dataset.
+        let is_new = episode.task() == self.tasks.len() as u64 - 1;
+        if is_new && !self.episodes.iter().any(|done| done.task == self.tasks[episode.task() as usize]) {
+            self.tasks.pop();
         }
         Ok(())
     }
@@ -261,6 +288,7 @@ impl DatasetWriter {
         let mut paths: Vec<PathBuf> =
             numbers.map(|number| temporary(&self.dir.join(data_path(number)))).collect();
         paths.extend(recording.file.map(|file| file.path().to_owned()));
+        paths.extend(self.orphans(&recording.record.attachments));
         paths.iter().try_for_each(|path| remove_file(path).map_err(WriteError::io("remove", path)))
     }
 
@@ -337,4 +365,6 @@ fn fill_source(record: &mut EpisodeRecord, source: &RecordingInfo) {
 }
 
 #[cfg(test)]
-mod tests;
+mod layout_tests;
+#[cfg(test)]
+pub(crate) mod tests;

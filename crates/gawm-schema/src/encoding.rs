@@ -89,7 +89,9 @@ impl Encoding {
         match kind {
             Kind::Linear | Kind::Gripper | Kind::Bool => Encoding::Identity,
             Kind::Angle { .. } => Encoding::SinCos,
-            Kind::Quaternion { .. } | Kind::Rotvec | Kind::Euler { .. } | Kind::Matrix => Encoding::Rotation6d,
+            Kind::Quaternion { .. } | Kind::Rotvec | Kind::Euler { .. } | Kind::Matrix => {
+                Encoding::Rotation6d
+            }
         }
     }
 
@@ -97,7 +99,9 @@ impl Encoding {
     pub fn of_action(kind: Kind) -> Encoding {
         match kind {
             Kind::Linear | Kind::Gripper | Kind::Bool | Kind::Angle { .. } => Encoding::Identity,
-            Kind::Quaternion { .. } | Kind::Rotvec | Kind::Euler { .. } | Kind::Matrix => Encoding::RotationVector,
+            Kind::Quaternion { .. } | Kind::Rotvec | Kind::Euler { .. } | Kind::Matrix => {
+                Encoding::RotationVector
+            }
         }
     }
 
@@ -227,10 +231,19 @@ impl Encoder {
     }
 
     /// Returns the element's common name if that makes new dim names, else the (unique) name of its first dim.
-    fn unique_base(&self, common: &str, first: &str, feature: &Feature, encoding: Encoding, prefix: bool) -> String {
+    fn unique_base(
+        &self,
+        common: &str,
+        first: &str,
+        feature: &Feature,
+        encoding: Encoding,
+        prefix: bool,
+    ) -> String {
         let full = |name: &str| if prefix { format!("{}:{name}", feature.name) } else { name.to_owned() };
         let taken = |base: &str| {
-            suffixes(encoding).iter().any(|suffix| self.dims.iter().any(|dim| dim.name == format!("{base}{suffix}")))
+            suffixes(encoding)
+                .iter()
+                .any(|suffix| self.dims.iter().any(|dim| dim.name == format!("{base}{suffix}")))
         };
         let common = full(common);
         if taken(&common) { full(first) } else { common }

@@ -102,7 +102,8 @@ pub fn matrix_from_six(s: [f64; 6]) -> Option<Matrix> {
 
 /// Returns the determinant of a matrix.
 pub fn determinant(m: &Matrix) -> f64 {
-    m[0] * (m[4] * m[8] - m[5] * m[7]) - m[1] * (m[3] * m[8] - m[5] * m[6]) + m[2] * (m[3] * m[7] - m[4] * m[6])
+    m[0] * (m[4] * m[8] - m[5] * m[7]) - m[1] * (m[3] * m[8] - m[5] * m[6])
+        + m[2] * (m[3] * m[7] - m[4] * m[6])
 }
 
 fn unit(v: [f64; 3]) -> Option<[f64; 3]> {
@@ -139,7 +140,11 @@ fn about_z(a: f64) -> Matrix {
 /// R = Rx(a) Ry(b) Rz(c).
 fn intrinsic_xyz(m: &Matrix) -> [f64; 3] {
     let b = m[2].clamp(-1.0, 1.0).asin();
-    if m[2].abs() > GIMBAL { [m[7].atan2(m[4]), b, 0.0] } else { [(-m[5]).atan2(m[8]), b, (-m[1]).atan2(m[0])] }
+    if m[2].abs() > GIMBAL {
+        [m[7].atan2(m[4]), b, 0.0]
+    } else {
+        [(-m[5]).atan2(m[8]), b, (-m[1]).atan2(m[0])]
+    }
 }
 
 /// R = Rz(a) Ry(b) Rx(c).

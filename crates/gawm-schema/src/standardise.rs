@@ -48,7 +48,12 @@ impl Standardisation {
     ///
     /// # Panics
     /// If `dims` and `moments` differ in length.
-    pub fn fit(column: &str, dims: &[EncodedDim], moments: &[Moments], fitted_on: FittedOn) -> Standardisation {
+    pub fn fit(
+        column: &str,
+        dims: &[EncodedDim],
+        moments: &[Moments],
+        fitted_on: FittedOn,
+    ) -> Standardisation {
         assert_eq!(dims.len(), moments.len(), "one set of moments per encoded dim");
         let dims = dims
             .iter()

@@ -56,7 +56,9 @@ pub enum SchemaError {
         got: usize,
     },
     /// Limits are not an interval.
-    #[error("limits of dim {dim:?} of feature {feature:?} are {limits:?}, expected finite [low, high] with low < high")]
+    #[error(
+        "limits of dim {dim:?} of feature {feature:?} are {limits:?}, expected finite [low, high] with low < high"
+    )]
     Limits {
         /// The feature.
         feature: String,
@@ -66,7 +68,9 @@ pub enum SchemaError {
         limits: [f64; 2],
     },
     /// An image size is impossible.
-    #[error("image feature {feature:?} is {height}x{width}x{channels}, expected sides of 1 to 65535 and 1 or 3 channels")]
+    #[error(
+        "image feature {feature:?} is {height}x{width}x{channels}, expected sides of 1 to 65535 and 1 or 3 channels"
+    )]
     ImageSize {
         /// The feature.
         feature: String,
@@ -120,7 +124,8 @@ impl Schema {
 
     /// Returns the hash of the schema in canonical JSON.
     pub fn hash(&self) -> ContentHash {
-        let value = serde_json::to_value(self).expect("a schema has only string keys and finite numbers are not needed");
+        let value = serde_json::to_value(self)
+            .expect("a schema has only string keys and finite numbers are not needed");
         ContentHash::of_json(&value)
     }
 

@@ -39,7 +39,12 @@ pub(super) fn run(arguments: &DiffArguments) -> Result<u8, Failure> {
 fn table(found: &Difference) -> String {
     let mut out = String::new();
     // Writing to a String cannot fail.
-    writeln!(out, "rows {} and {}, episodes {} and {}", found.rows[0], found.rows[1], found.episodes[0], found.episodes[1]).ok();
+    writeln!(
+        out,
+        "rows {} and {}, episodes {} and {}",
+        found.rows[0], found.rows[1], found.episodes[0], found.episodes[1]
+    )
+    .ok();
     found.schema.iter().for_each(|line| {
         writeln!(out, "{line}").ok();
     });
@@ -47,7 +52,15 @@ fn table(found: &Difference) -> String {
     for dim in &found.dims {
         let name = format!("{}[{}]", dim.column, dim.dim);
         let pair = |v: [f64; 2]| format!("{:>11.5} {:>11.5}", v[0], v[1]);
-        writeln!(out, "{name:<44} {:>6.3} {:>8.3} {:>24} {:>24}", dim.ks, dim.psi, pair(dim.mean), pair(dim.std)).ok();
+        writeln!(
+            out,
+            "{name:<44} {:>6.3} {:>8.3} {:>24} {:>24}",
+            dim.ks,
+            dim.psi,
+            pair(dim.mean),
+            pair(dim.std)
+        )
+        .ok();
     }
     out
 }

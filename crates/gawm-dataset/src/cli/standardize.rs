@@ -16,7 +16,10 @@ pub(super) struct StandardizeArguments {
 pub(super) fn run(arguments: &StandardizeArguments) -> Result<u8, Failure> {
     let dataset = open(&arguments.dir)?;
     if dataset.gawm.is_none() {
-        let error = anyhow::anyhow!("expected a dataset with meta/gawm.json, got none in {}", arguments.dir.display());
+        let error = anyhow::anyhow!(
+            "expected a dataset with meta/gawm.json, got none in {}",
+            arguments.dir.display()
+        );
         return Err(Failure::from(error).hint("only datasets written by gawm have a standardisation"));
     }
     crate::standardize(&arguments.dir)?;

@@ -150,7 +150,7 @@ fn append_vector(
     to: usize,
 ) {
     let width = dims.len();
-    let mut at = dims.first().map_or(0, Vec::len);
+    let filled = dims.first().map_or(0, Vec::len);
     let layers = Layers::of(array.as_ref());
     let leaf = Leaf::of(layers.leaf);
     if let Some(leaf) = &leaf
@@ -159,7 +159,7 @@ fn append_vector(
     {
         return;
     }
-    for row in from..to {
+    for (at, row) in (filled..).zip(from..to) {
         let range = layers.range(row);
         match (&range, &leaf) {
             (Some((start, end)), Some(leaf)) if end - start == width => {
@@ -178,7 +178,6 @@ fn append_vector(
                 if range.is_none() { nulls.note(at) } else { wrong_widths.note(at) }
             }
         }
-        at += 1;
     }
 }
 

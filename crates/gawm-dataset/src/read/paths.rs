@@ -38,7 +38,7 @@ pub(super) fn fill(template: &str, values: TemplateValues<'_>) -> Result<String,
             f => f
                 .trim_end_matches('d')
                 .parse::<usize>()
-                .map_err(|_| format!("the unknown format {f:?} in {template:?}"))?,
+                .map_err(|e| format!("the unknown format {f:?} ({e}) in {template:?}"))?,
         };
         if digits > 20 {
             return Err(format!("a width of {digits} digits in {template:?}"));

@@ -19,7 +19,12 @@ pub(super) fn histogram(counts: &[u64], title: &str) -> String {
         // A count that is not zero is seen.
         let height = (HEIGHT * *count as f64 / most).max(1.0);
         let (x, y) = (i as f64 * width, HEIGHT - height);
-        write!(out, "<rect class=\"bar\" x=\"{x:.1}\" y=\"{y:.1}\" width=\"{:.1}\" height=\"{height:.1}\"/>", (width - 0.5).max(0.5)).ok();
+        write!(
+            out,
+            "<rect class=\"bar\" x=\"{x:.1}\" y=\"{y:.1}\" width=\"{:.1}\" height=\"{height:.1}\"/>",
+            (width - 0.5).max(0.5)
+        )
+        .ok();
     }
     out + "</svg>"
 }
@@ -38,7 +43,13 @@ pub(super) fn trace(values: &[f64], title: &str, mark: Option<(f64, f64)>) -> St
     let (low, high) = finite.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
     let mut out = open(title);
     if let Some((from, to)) = mark {
-        write!(out, "<rect class=\"mark\" x=\"{:.1}\" y=\"0\" width=\"{:.1}\" height=\"{HEIGHT}\"/>", from * WIDTH, ((to - from) * WIDTH).max(2.0)).ok();
+        write!(
+            out,
+            "<rect class=\"mark\" x=\"{:.1}\" y=\"0\" width=\"{:.1}\" height=\"{HEIGHT}\"/>",
+            from * WIDTH,
+            ((to - from) * WIDTH).max(2.0)
+        )
+        .ok();
     }
     let range = if high > low { high - low } else { 1.0 };
     let step = WIDTH / (values.len().max(2) - 1) as f64;
@@ -58,5 +69,8 @@ pub(super) fn trace(values: &[f64], title: &str, mark: Option<(f64, f64)>) -> St
 }
 
 fn open(title: &str) -> String {
-    format!("<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" preserveAspectRatio=\"none\" role=\"img\" aria-label=\"{}\">", super::escape(title))
+    format!(
+        "<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" preserveAspectRatio=\"none\" role=\"img\" aria-label=\"{}\">",
+        super::escape(title)
+    )
 }

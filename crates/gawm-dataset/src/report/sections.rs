@@ -31,14 +31,18 @@ const CLIP_MARGIN: usize = 30;
 pub(super) fn overview(material: &Material<'_>, page: &mut String) {
     let (report, dataset) = (&material.examination.report, material.dataset);
     let seconds = report.rows as f64 / dataset.info.fps;
-    let length = if seconds < 120.0 { format!("{seconds:.0} s") } else { format!("{:.1} min", seconds / 60.0) };
+    let length =
+        if seconds < 120.0 { format!("{seconds:.0} s") } else { format!("{:.1} min", seconds / 60.0) };
     let mut facts = vec![
         (report.episodes.to_string(), "episodes"),
         (report.rows.to_string(), "rows"),
         (format!("{} Hz", dataset.info.fps), "declared rate"),
         (length, "of motion"),
         (format!("{:.1} %", 100.0 * report.windows.share_of_rows), "of rows begin a usable window"),
-        (format!("LeRobot {}", report.format), if dataset.gawm.is_some() { "written by gawm" } else { "format" }),
+        (
+            format!("LeRobot {}", report.format),
+            if dataset.gawm.is_some() { "written by gawm" } else { "format" },
+        ),
     ];
     if let Some(robot) = &dataset.info.robot_type {
         facts.push((robot.clone(), "robot"));
@@ -58,7 +62,9 @@ fn by_rule<'a>(findings: &'a [Finding]) -> Vec<Vec<&'a Finding>> {
     let mut groups: Vec<Vec<&'a Finding>> = Vec::new();
     for finding in findings {
         match groups.last_mut() {
-            Some(group) if group[0].code == finding.code && group[0].severity == finding.severity => group.push(finding),
+            Some(group) if group[0].code == finding.code && group[0].severity == finding.severity => {
+                group.push(finding)
+            }
             _ => groups.push(vec![finding]),
         }
     }
@@ -68,11 +74,17 @@ fn by_rule<'a>(findings: &'a [Finding]) -> Vec<Vec<&'a Finding>> {
 pub(super) fn alerts(material: &Material<'_>, page: &mut String) {
     let report = &material.examination.report;
     let counts = report.counts;
-    write!(page, "<section id=\"alerts\"><h2>Alerts</h2><p>{} errors, {} warnings, {} notes.</p>", counts.error, counts.warning, counts.info).ok();
+    write!(
+        page,
+        "<section id=\"alerts\"><h2>Alerts</h2><p>{} errors, {} warnings, {} notes.</p>",
+        counts.error, counts.warning, counts.info
+    )
+    .ok();
     if counts.error + counts.warning == 0 {
         page.push_str("<p class=\"ok\">Nothing that harms training was found.</p>");
     }
-    let (notes, alerts): (Vec<_>, Vec<_>) = by_rule(&report.findings).into_iter().partition(|g| g[0].severity == Severity::Info);
+    let (notes, alerts): (Vec<_>, Vec<_>) =
+        by_rule(&report.findings).into_iter().partition(|g| g[0].severity == Severity::Info);
     alerts.iter().for_each(|group| alert(material, group, page));
     if !notes.is_empty() {
         write!(page, "<details><summary>{} notes</summary>", counts.info).ok();
@@ -87,7 +99,8 @@ fn alert(material: &Material<'_>, group: &[&Finding], page: &mut String) {
     let (level, title) = (first.severity.text(), rule(first.code).map_or("", |r| r.title));
     write!(page, "<div class=\"alert {level}\"><span class=\"level\">{level}</span> <span class=\"code\">{}</span> {}<ul>", first.code, escape(title)).ok();
     for finding in group.iter().take(SHOWN_FINDINGS) {
-        let message = if material.options.is_shared { shared(&finding.message) } else { finding.message.clone() };
+        let message =
+            if material.options.is_shared { shared(&finding.message) } else { finding.message.clone() };
         write!(page, "<li>{}{}</li>", escape(&place(finding)), escape(&message)).ok();
     }
     if group.len() > SHOWN_FINDINGS {
@@ -113,7 +126,9 @@ fn shared(message: &str) -> String {
 fn place(finding: &Finding) -> String {
     let mut parts = Vec::new();
     parts.extend(finding.episode.map(|e| format!("episode {e}")));
-    parts.extend(finding.rows.map(|[a, b]| if b == a + 1 { format!("row {a}") } else { format!("rows {a} to {b}") }));
+    parts.extend(
+        finding.rows.map(|[a, b]| if b == a + 1 { format!("row {a}") } else { format!("rows {a} to {b}") }),
+    );
     parts.extend(finding.feature.as_ref().map(|f| match &finding.dim {
         Some(dim) => format!("{f}[{dim}]"),
         None => f.clone(),
@@ -125,7 +140,9 @@ fn place(finding: &Finding) -> String {
 pub(super) fn worst_clips(material: &Material<'_>, page: &mut String) {
     let dataset = material.dataset;
     let mut seen: BTreeMap<(&str, Option<i64>), usize> = BTreeMap::new();
-    let is_clip = |f: &&Finding| f.severity >= Severity::Warning && f.rows.is_some() && f.episode.is_some() && f.dim.is_some();
+    let is_clip = |f: &&Finding| {
+        f.severity >= Severity::Warning && f.rows.is_some() && f.episode.is_some() && f.dim.is_some()
+    };
     let clips: Vec<&Finding> = material
         .examination
         .report
@@ -147,7 +164,9 @@ pub(super) fn worst_clips(material: &Material<'_>, page: &mut String) {
     columns.dedup();
     let scanned = dataset.scan(&columns, |rows| {
         let wanted = clips.iter().enumerate().filter(|(_, f)| f.episode == Some(rows.run.episode_index));
-        wanted.filter_map(|(i, f)| clip_values(dataset, &rows, f).map(|values| (i, values))).collect::<Vec<_>>()
+        wanted
+            .filter_map(|(i, f)| clip_values(dataset, &rows, f).map(|values| (i, values)))
+            .collect::<Vec<_>>()
     });
     let Ok((found, _)) = scanned else { return };
     let mut found: Vec<(usize, Clip)> = found.into_iter().flatten().collect();
@@ -160,7 +179,13 @@ pub(super) fn worst_clips(material: &Material<'_>, page: &mut String) {
         let finding = clips[i];
         let title = format!("{} {}", finding.code, place(finding).trim_end_matches(": "));
         let drawing = chart::trace(&clip.values, &title, Some(clip.mark));
-        write!(page, "<div class=\"dim\"><b>{}</b><small>{}</small>{drawing}</div>", escape(&title), escape(&finding.message)).ok();
+        write!(
+            page,
+            "<div class=\"dim\"><b>{}</b><small>{}</small>{drawing}</div>",
+            escape(&title),
+            escape(&finding.message)
+        )
+        .ok();
     }
     page.push_str("</div></section>\n");
 }
@@ -170,7 +195,11 @@ struct Clip {
     mark: (f64, f64),
 }
 
-fn clip_values(dataset: &crate::read::Dataset, rows: &crate::read::EpisodeRows, finding: &Finding) -> Option<Clip> {
+fn clip_values(
+    dataset: &crate::read::Dataset,
+    rows: &crate::read::EpisodeRows,
+    finding: &Finding,
+) -> Option<Clip> {
     let (feature, dim, [first, end]) = (finding.feature.as_ref()?, finding.dim.as_ref()?, finding.rows?);
     let labels = crate::validate::dim_labels(dataset, feature);
     let dim = labels.iter().position(|l| l.name == *dim).or_else(|| dim.parse().ok())?;
@@ -180,7 +209,10 @@ fn clip_values(dataset: &crate::read::Dataset, rows: &crate::read::EpisodeRows, 
     let shown = values.get(from..to).filter(|v| v.len() > 1)?;
     let share = |row: usize| (row - from) as f64 / (to - from) as f64;
     let stride = shown.len().div_ceil(300);
-    Some(Clip { values: shown.iter().step_by(stride).copied().collect(), mark: (share(first), share(end.max(first))) })
+    Some(Clip {
+        values: shown.iter().step_by(stride).copied().collect(),
+        mark: (share(first), share(end.max(first))),
+    })
 }
 
 pub(super) fn streams(material: &Material<'_>, page: &mut String) {
@@ -190,7 +222,9 @@ pub(super) fn streams(material: &Material<'_>, page: &mut String) {
         values.sort_by(f64::total_cmp);
         values
     };
-    let at = |values: &[f64], q: f64| values.get(((values.len().max(1) - 1) as f64 * q) as usize).copied().unwrap_or(0.0);
+    let at = |values: &[f64], q: f64| {
+        values.get(((values.len().max(1) - 1) as f64 * q) as usize).copied().unwrap_or(0.0)
+    };
     let (rate, gap, jitter) = (of(|e| e.rate_hz), of(|e| e.longest_periods), of(|e| e.jitter_periods));
     page.push_str("<section id=\"streams\"><h2>Clock and streams</h2>");
     write!(
@@ -227,8 +261,13 @@ pub(super) fn streams(material: &Material<'_>, page: &mut String) {
 
 pub(super) fn dims(material: &Material<'_>, page: &mut String) {
     page.push_str("<section id=\"dims\"><h2>Dims</h2>");
-    for column in material.stats.columns.iter().filter(|c| c.name != "timestamp" && !c.name.starts_with("gawm.valid") && !c.name.contains("age_ms")) {
-        let encoding = if column.name.starts_with("gawm.") { " <span class=\"soft\">encoded</span>" } else { "" };
+    for column in
+        material.stats.columns.iter().filter(|c| {
+            c.name != "timestamp" && !c.name.starts_with("gawm.valid") && !c.name.contains("age_ms")
+        })
+    {
+        let encoding =
+            if column.name.starts_with("gawm.") { " <span class=\"soft\">encoded</span>" } else { "" };
         write!(page, "<h3>{}{encoding}</h3><div class=\"dims\">", escape(&column.name)).ok();
         for dim in column.dims.iter().take(SHOWN_DIMS) {
             let s = dim.values.summary();
@@ -262,7 +301,18 @@ pub(super) fn episodes(material: &Material<'_>, page: &mut String) {
             counts.1 += u64::from(finding.severity == Severity::Warning);
         }
     }
-    let head = ["episode", "rows", "seconds", "errors", "warnings", "idle %", "jitter %", "longest step", "success", "task"];
+    let head = [
+        "episode",
+        "rows",
+        "seconds",
+        "errors",
+        "warnings",
+        "idle %",
+        "jitter %",
+        "longest step",
+        "success",
+        "task",
+    ];
     page.push_str("<section id=\"episodes\"><h2>Episodes</h2><div class=\"scroll\"><table class=\"sortable\"><thead><tr>");
     head.iter().for_each(|name| {
         write!(page, "<th><button type=\"button\">{name}</button></th>").ok();
@@ -272,7 +322,8 @@ pub(super) fn episodes(material: &Material<'_>, page: &mut String) {
         let (errors, warnings) = alerts.get(&e.episode).copied().unwrap_or_default();
         let entry = material.dataset.entry(e.episode);
         let success = entry.and_then(|x| x.extra_text("success")).unwrap_or_default();
-        let task: String = entry.and_then(|x| x.tasks.first()).map_or(String::new(), |t| t.chars().take(60).collect());
+        let task: String =
+            entry.and_then(|x| x.tasks.first()).map_or(String::new(), |t| t.chars().take(60).collect());
         write!(
             page,
             "<tr><td>{}</td><td>{}</td><td>{:.1}</td><td>{errors}</td><td>{warnings}</td><td>{:.0}</td><td>{:.1}</td><td>{:.2}</td><td>{}</td><td>{}</td></tr>",
@@ -282,7 +333,12 @@ pub(super) fn episodes(material: &Material<'_>, page: &mut String) {
     }
     page.push_str("</tbody></table></div>");
     if material.examination.episodes.len() > SHOWN_EPISODES {
-        write!(page, "<p class=\"soft\">and {} more episodes</p>", material.examination.episodes.len() - SHOWN_EPISODES).ok();
+        write!(
+            page,
+            "<p class=\"soft\">and {} more episodes</p>",
+            material.examination.episodes.len() - SHOWN_EPISODES
+        )
+        .ok();
     }
     page.push_str("</section>\n");
 }
@@ -290,8 +346,13 @@ pub(super) fn episodes(material: &Material<'_>, page: &mut String) {
 pub(super) fn cameras(material: &Material<'_>, page: &mut String) {
     let dataset = material.dataset;
     let cameras = dataset.image_columns();
-    let videos: Vec<&str> =
-        dataset.info.features.iter().filter(|f| f.is_camera() && !cameras.contains(&f.name)).map(|f| f.name.as_str()).collect();
+    let videos: Vec<&str> = dataset
+        .info
+        .features
+        .iter()
+        .filter(|f| f.is_camera() && !cameras.contains(&f.name))
+        .map(|f| f.name.as_str())
+        .collect();
     if cameras.is_empty() && videos.is_empty() {
         return;
     }
@@ -305,7 +366,8 @@ pub(super) fn cameras(material: &Material<'_>, page: &mut String) {
             let run_index = k * n_runs / SHEET_FRAMES.min(n_runs.max(1) * 4);
             let Some(run) = dataset.runs.get(run_index) else { continue };
             let row = (run.n_rows as usize * (2 * k + 1) / (2 * SHEET_FRAMES)).min(run.n_rows as usize - 1);
-            let frame = dataset.read_frames(run_index, camera, &[row]).ok().and_then(|f| f.into_iter().next());
+            let frame =
+                dataset.read_frames(run_index, camera, &[row]).ok().and_then(|f| f.into_iter().next());
             let caption = format!("episode {}, row {row}", run.episode_index);
             match frame.and_then(|f| embedded(&f)) {
                 Some(source) => write!(page, "<figure><img alt=\"{caption}\" src=\"{source}\"><figcaption>{caption}</figcaption></figure>"),
@@ -327,13 +389,24 @@ fn skew(material: &Material<'_>, page: &mut String) {
     let is_camera = |name: &str| {
         let name = name.to_ascii_lowercase();
         ["cam", "image", "rgb", "video"].iter().any(|word| name.contains(word))
-            || material.dataset.info.features.iter().any(|f| f.is_camera() && f.name.to_ascii_lowercase().ends_with(&name))
+            || material
+                .dataset
+                .info
+                .features
+                .iter()
+                .any(|f| f.is_camera() && f.name.to_ascii_lowercase().ends_with(&name))
     };
     let cameras: Vec<_> = ages.dims.iter().filter(|d| is_camera(&d.name)).collect();
     for (i, a) in cameras.iter().enumerate() {
         for b in &cameras[i + 1..] {
             let apart = (a.values.summary().q50 - b.values.summary().q50).abs();
-            write!(page, "<p>Samples of {} and {} are {apart:.1} ms apart in the median.</p>", escape(&a.name), escape(&b.name)).ok();
+            write!(
+                page,
+                "<p>Samples of {} and {} are {apart:.1} ms apart in the median.</p>",
+                escape(&a.name),
+                escape(&b.name)
+            )
+            .ok();
         }
     }
 }

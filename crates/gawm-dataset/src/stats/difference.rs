@@ -61,7 +61,12 @@ pub fn difference(a: &DatasetStats, b: &DatasetStats) -> Difference {
     Difference { schema, rows: [a.rows, b.rows], episodes, dims }
 }
 
-fn compare_columns(a: &ColumnTotals, b: &ColumnTotals, schema: &mut Vec<String>, dims: &mut Vec<DimDifference>) {
+fn compare_columns(
+    a: &ColumnTotals,
+    b: &ColumnTotals,
+    schema: &mut Vec<String>,
+    dims: &mut Vec<DimDifference>,
+) {
     if a.dims.len() != b.dims.len() {
         schema.push(format!("column {} has {} dims and {}", a.name, a.dims.len(), b.dims.len()));
         return;
@@ -98,7 +103,14 @@ fn compare_dims(column: &str, a: &DimTotals, b: &DimTotals) -> Option<DimDiffere
         psi += (p - q) * (p / q).ln();
     }
     let (p, q) = (a.values.summary(), b.values.summary());
-    Some(DimDifference { column: column.to_owned(), dim: a.name.clone(), ks, psi, mean: [p.mean, q.mean], std: [p.std, q.std] })
+    Some(DimDifference {
+        column: column.to_owned(),
+        dim: a.name.clone(),
+        ks,
+        psi,
+        mean: [p.mean, q.mean],
+        std: [p.std, q.std],
+    })
 }
 
 fn quantile_function(dim: &DimTotals) -> Option<Vec<f64>> {
@@ -129,7 +141,13 @@ mod tests {
     fn dim(values: impl Iterator<Item = f64>) -> DimTotals {
         let mut stats = DimStats::new(false);
         values.for_each(|v| stats.update(v));
-        DimTotals { name: "x".into(), unit: String::new(), values: stats, motion: MotionStats::default(), trace: Vec::new() }
+        DimTotals {
+            name: "x".into(),
+            unit: String::new(),
+            values: stats,
+            motion: MotionStats::default(),
+            trace: Vec::new(),
+        }
     }
 
     fn check(shift: f64, expected_ks: f64) {

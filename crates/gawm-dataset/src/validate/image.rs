@@ -194,13 +194,12 @@ impl Judge<'_> {
             f.is_picture && f64::from(f.mean) > bounds.white_luma && f64::from(f.std) < bounds.flat_luma
         };
         for (run, camera) in self.runs {
-            let cases: [(&str, &str, &dyn Fn(&FrameMeasure) -> bool); 2] =
+            let cases: [(&'static str, &str, IsFlat<'_>); 2] =
                 [("IMAGE-004", "black", &is_black), ("IMAGE-005", "white", &is_white)];
             for (code, what, is_flat) in cases {
                 let Some(first) = camera.frames.iter().position(is_flat) else { continue };
                 let n = camera.frames.iter().filter(|f| is_flat(f)).count();
                 let n_rows = camera.frames[first..].iter().take_while(|f| is_flat(f)).count();
-                let code = if code == "IMAGE-004" { "IMAGE-004" } else { "IMAGE-005" };
                 findings.push(
                     self.finding(code, run, format!("{n} frames are {what}"))
                         .rows(first, first + n_rows)
@@ -286,12 +285,12 @@ impl Judge<'_> {
         if self.runs.len() < 4 {
             return;
         }
-        let of = |camera: &CameraRun, f: fn(&FrameMeasure) -> f32| {
+        let of = |camera: &CameraRun, f: Level| {
             median(
                 &camera.frames.iter().filter(|m| m.is_picture).map(|m| f64::from(f(m))).collect::<Vec<_>>(),
             )
         };
-        let measures: [(&str, fn(&FrameMeasure) -> f32); 2] =
+        let measures: [(&str, Level); 2] =
             [("brightness", |f| f.mean), ("contrast", |f| f.std)];
         for (what, measure) in measures {
             let levels: Vec<f64> = self.runs.iter().map(|(_, c)| of(c, measure)).collect();
@@ -333,6 +332,11 @@ impl Judge<'_> {
         }
     }
 }
+
+/// Whether a frame is of one colour.
+type IsFlat<'a> = &'a dyn Fn(&FrameMeasure) -> bool;
+/// Picks a level of a frame.
+type Level = fn(&FrameMeasure) -> f32;
 
 struct Repeats {
     frozen: Stretch,

@@ -70,7 +70,9 @@ fn best(profile: &[f64; SHIFTS]) -> usize {
 fn moved_by(profile: &[f64; SHIFTS], typical: &[f64; SHIFTS]) -> Option<i64> {
     const MOST: i64 = 4;
     let error = |by: i64| {
-        let inside = |k: i64| (0..SHIFTS as i64).contains(&(k + by)).then(|| profile[(k + by) as usize] - typical[k as usize]);
+        let inside = |k: i64| {
+            (0..SHIFTS as i64).contains(&(k + by)).then(|| profile[(k + by) as usize] - typical[k as usize])
+        };
         let gaps: Vec<f64> = (0..SHIFTS as i64).filter_map(inside).collect();
         gaps.iter().map(|g| g * g).sum::<f64>() / gaps.len() as f64
     };
@@ -108,7 +110,8 @@ impl Judge<'_> {
             let here = best(profile);
             if let Some(by) = moved_by(profile, &typical) {
                 let message = format!("the action acts {by:+} rows from where it does in the other episodes");
-                let finding = Finding::new("SEMANTIC-001", message).episode(run.episode).feature(self.action_feature());
+                let finding =
+                    Finding::new("SEMANTIC-001", message).episode(run.episode).feature(self.action_feature());
                 findings.push(finding.rows(0, run.n_rows).measured(by as f64, 0.0));
             } else if profile[here] > 0.2 * typical[usual] && typical[usual] < -0.5 {
                 let message = format!(
@@ -116,7 +119,8 @@ impl Judge<'_> {
                     100.0 * (1.0 - profile[here].exp()),
                     100.0 * (1.0 - typical[usual].exp())
                 );
-                let finding = Finding::new("SEMANTIC-005", message).episode(run.episode).feature(self.action_feature());
+                let finding =
+                    Finding::new("SEMANTIC-005", message).episode(run.episode).feature(self.action_feature());
                 let bound = 1.0 - (0.2 * typical[usual]).exp();
                 findings.push(finding.rows(0, run.n_rows).measured(1.0 - profile[here].exp(), bound));
             }
@@ -126,8 +130,8 @@ impl Judge<'_> {
     /// Judges the shift that all episodes share.
     fn shift_of_all(&self, typical: &[f64; SHIFTS], usual: usize, margin: f64, findings: &mut Vec<Finding>) {
         let is_better = typical[NO_SHIFT] - typical[usual] >= margin;
-        // Smooth commands explain motion before they are given; one that acts at row t explains it at row t as well.
-        let is_late = typical[NO_SHIFT] > 0.35 * typical[usual];
+        // Smooth commands are known before they are given; only a sharp best shift is the one at which they act.
+        let is_late = usual > NO_SHIFT && typical[usual - 1] - typical[usual] >= margin;
         if usual > NO_SHIFT && is_better && is_late {
             let by = usual - NO_SHIFT;
             let message = format!(

@@ -9,6 +9,8 @@ use super::{
 
 /// Most candidates for jumps kept per dim and run.
 const MAX_JUMPS: usize = 12;
+/// A jump is this many times longer than the steps beside it.
+const ISOLATED: f64 = 2.5;
 /// Rows of a window for noise.
 pub(super) const NOISE_ROWS: usize = 24;
 
@@ -219,6 +221,9 @@ fn unsteadiness(steps: &[f64], signal: &mut Signal) {
     signal.rough50 = quantile(&rough, 0.5);
     let floor = (4.0 * signal.rough99).max(0.01 * signal.range());
     for (t, size) in rough.iter().enumerate().filter(|(_, size)| **size > floor) {
+        if !is_isolated(steps, t) {
+            continue;
+        }
         signal.n_jumps += 1;
         signal.jumps.push(Jump { row: t + 1, size: *size });
         if signal.jumps.len() > 4 * MAX_JUMPS {
@@ -234,6 +239,18 @@ fn unsteadiness(steps: &[f64], signal: &mut Signal) {
     signal.noisiest = windows
         .max_by(|a, b| a.1.total_cmp(&b.1))
         .map(|(i, level)| (Stretch { start: i * NOISE_ROWS, n_rows: NOISE_ROWS }, level));
+}
+
+/// Returns whether step `t` stands alone: a fast motion has fast steps beside it, a jump has not.
+fn is_isolated(steps: &[f64], t: usize) -> bool {
+    let here = steps[t];
+    let beside = |other: Option<usize>| {
+        let step = other.and_then(|o| steps.get(o)).copied().unwrap_or(0.0);
+        // The way back from a spike belongs to it.
+        let is_return = step * here < 0.0 && step.abs() > 0.5 * here.abs();
+        if is_return || !step.is_finite() { 0.0 } else { step.abs() }
+    };
+    here.abs() > ISOLATED * beside(t.checked_sub(1)).max(beside(Some(t + 1)))
 }
 
 fn keep_largest(jumps: &mut Vec<Jump>) {

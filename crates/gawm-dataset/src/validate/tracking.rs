@@ -58,8 +58,12 @@ pub(super) fn track(
         pairs.iter().map(|(a, s)| pair_profile(actions[*a], states[*s])).collect();
     let spreads: Vec<f64> = pairs.iter().map(|(_, s)| variance(states[*s]).sqrt()).collect();
     let idle = IDLE_SHARE * spreads.iter().copied().fold(0.0, f64::max);
-    let moving: Vec<&[f64; SHIFTS]> =
-        profiles.iter().zip(&spreads).filter(|(_, spread)| **spread > idle).filter_map(|(p, _)| p.residuals.as_ref()).collect();
+    let moving: Vec<&[f64; SHIFTS]> = profiles
+        .iter()
+        .zip(&spreads)
+        .filter(|(_, spread)| **spread > idle)
+        .filter_map(|(p, _)| p.residuals.as_ref())
+        .collect();
     let profile = (!moving.is_empty()).then(|| {
         let mut mean = [0.0; SHIFTS];
         for residuals in &moving {
@@ -151,7 +155,7 @@ fn residuals(action: &[f64], state: &[f64], stride: usize) -> Option<[f64; SHIFT
         let with = fit::<4>(
             rows().map(|t| ([1.0, state[t] - state[t - 1], state[t], at(t)], state[t + 1] - state[t])),
         )?;
-        *value = (with / without).max(1e-6).min(1.0).ln();
+        *value = (with / without).clamp(1e-6, 1.0).ln();
     }
     Some(out)
 }
@@ -195,9 +199,8 @@ fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; 
         b.swap(i, pivot);
         for k in i + 1..N {
             let factor = a[k][i] / a[i][i];
-            for j in i..N {
-                a[k][j] -= factor * a[i][j];
-            }
+            let pivot_row = a[i];
+            a[k].iter_mut().zip(pivot_row).skip(i).for_each(|(v, p)| *v -= factor * p);
             b[k] -= factor * b[i];
         }
     }

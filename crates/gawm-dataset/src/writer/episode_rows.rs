@@ -8,7 +8,7 @@ use gawm_schema::{ContentHash, DimStats, DimSummary, Role};
 use crate::block::{BlockPosition, RowBlock};
 use crate::camera::CameraStats;
 use crate::columns::Columns;
-use crate::data_file::DataFile;
+use crate::data_file::{DataFile, FileMark};
 use crate::episode::{EpisodeRecord, FeatureStats, is_policy_input};
 use crate::error::WriteError;
 use crate::rows::Rows;
@@ -27,6 +27,8 @@ pub(super) struct OpenEpisode {
     number: u64,
     task: u64,
     first_index: u64,
+    /// Where its first row is in the data file.
+    beginning: Option<FileMark>,
     /// Rows that have left the block.
     n_written: u64,
     block: RowBlock,
@@ -63,6 +65,7 @@ impl OpenEpisode {
             number,
             task,
             first_index,
+            beginning: None,
             n_written: 0,
             block: RowBlock::new(columns),
             block_bytes: 0,
@@ -77,6 +80,19 @@ impl OpenEpisode {
 
     pub(super) fn id(&self) -> &str {
         &self.info.id
+    }
+
+    pub(super) fn task(&self) -> u64 {
+        self.task
+    }
+
+    /// Notes where the episode begins in the data file; only the first call counts.
+    pub(super) fn begin_in(&mut self, mark: FileMark) {
+        self.beginning.get_or_insert(mark);
+    }
+
+    pub(super) fn beginning(&self) -> Option<FileMark> {
+        self.beginning
     }
 
     pub(super) fn length(&self) -> u64 {
@@ -165,6 +181,7 @@ impl OpenEpisode {
         file.write(columns, &self.block, position, self.block_bytes)
             .map_err(WriteError::parquet(file.path()))?;
         self.totals.update(columns, &self.block);
+        crate::camera::count_frames(columns, &self.block, self.n_written, &mut self.cameras);
         self.hash_block(columns);
         self.n_written += self.block.len() as u64;
         self.block.clear();

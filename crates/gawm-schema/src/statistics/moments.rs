@@ -78,7 +78,11 @@ impl Moments {
 
     /// Returns the standard deviation with ddof 1; 0 below two values.
     pub fn sample_std(&self) -> f64 {
-        if self.count < 2 || self.is_constant() { 0.0 } else { (self.m2 / (self.count - 1) as f64).max(0.0).sqrt() }
+        if self.count < 2 || self.is_constant() {
+            0.0
+        } else {
+            (self.m2 / (self.count - 1) as f64).max(0.0).sqrt()
+        }
     }
 
     /// Returns whether all values are equal; true without values.

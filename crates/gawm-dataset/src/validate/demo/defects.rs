@@ -260,7 +260,7 @@ pub(super) const DEFECTS: &[Defect] = &[
     }),
     here("differences labelled absolute", "SEMANTIC-003", |w, s| {
         let n = if s < 0.5 { 4 } else { JOINTS };
-        w.episodes[SICK].action[..n].iter_mut().for_each(|d| to_steps(d));
+        w.episodes[SICK].action[..n].iter_mut().for_each(to_steps);
     }),
     here("dead signal", "SEMANTIC-004", |w, s| {
         w.episodes[SICK].state[..up_to(s, 4)].iter_mut().for_each(|d| d.fill(0.25))

@@ -96,7 +96,7 @@ fn rows(world: &World) -> io::Result<RecordBatch> {
     columns.push(("index".into(), ints(index)));
     columns.push(("task_index".into(), ints(episodes().flat_map(|(_, e)| e.task_index.clone()).collect())));
     columns.push(("gawm.time_ns".into(), ints(episodes().flat_map(|(_, e)| e.time_ns.clone()).collect())));
-    let groups: [(&str, fn(&super::world::Episode) -> &Vec<Vec<f64>>); 6] = [
+    let groups: [(&str, DimsOf); 6] = [
         ("observation.state", |e| &e.state),
         ("action", |e| &e.action),
         ("observation.heading", |e| &e.heading),
@@ -132,6 +132,9 @@ fn rows(world: &World) -> io::Result<RecordBatch> {
         columns.iter().map(|(n, a)| Field::new(n, a.data_type().clone(), true)).collect();
     batch(Schema::new(fields), columns.into_iter().map(|(_, a)| a).collect())
 }
+
+/// Picks a group of dims of an episode.
+type DimsOf = fn(&super::world::Episode) -> &Vec<Vec<f64>>;
 
 #[derive(Default)]
 struct Lists {

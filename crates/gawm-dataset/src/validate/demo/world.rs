@@ -160,12 +160,12 @@ fn episode(random: &mut Random, number: usize, has_cameras: bool) -> Episode {
     }
     let tool = |t: usize, phase: f64| 0.3 * (state[0][t] + phase).sin() + 0.2 * (state[1][t] - phase).cos();
     let xyz: Vec<Vec<f64>> = [0.0, 1.0, 2.0].iter().map(|p| (0..n).map(|t| tool(t, *p)).collect()).collect();
-    let quaternion = quaternions(&state, n);
+    let quaternion = quaternions(&state);
     state.extend(xyz);
     state.extend(quaternion);
     let heading = (0..n).map(|t| 2.0 * state[2][t]).collect::<Vec<f64>>();
     let heading = vec![heading.iter().map(|a| a.sin()).collect(), heading.iter().map(|a| a.cos()).collect()];
-    let six = six_dims(&state, n);
+    let six = six_dims(&state);
     let age: Vec<f64> = (0..n).map(|_| 4.0 + 8.0 * random.uniform()).collect();
     let camera_age: Vec<f64> = (0..n).map(|_| 10.0 + 20.0 * random.uniform()).collect();
     let delay = |ages: &Vec<f64>, random: &mut Random, ms: f64| -> Vec<f64> {
@@ -221,10 +221,10 @@ fn target(random: &mut Random, n: usize) -> Vec<f64> {
     (0..n).map(|t| centre + at(t) + 2e-4 * random.normal()).collect()
 }
 
-fn quaternions(state: &[Vec<f64>], n: usize) -> Vec<Vec<f64>> {
-    let mut out = vec![Vec::with_capacity(n); 4];
-    for t in 0..n {
-        let q = [0.4 * state[3][t], 0.4 * state[4][t], 0.4 * state[5][t], 1.0];
+fn quaternions(state: &[Vec<f64>]) -> Vec<Vec<f64>> {
+    let mut out = vec![Vec::new(); 4];
+    for ((a, b), c) in state[3].iter().zip(&state[4]).zip(&state[5]) {
+        let q = [0.4 * a, 0.4 * b, 0.4 * c, 1.0];
         let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
         q.iter().zip(&mut out).for_each(|(v, dim)| dim.push(v / norm));
     }
@@ -232,10 +232,9 @@ fn quaternions(state: &[Vec<f64>], n: usize) -> Vec<Vec<f64>> {
 }
 
 /// The first two columns of a rotation about two axes.
-fn six_dims(state: &[Vec<f64>], n: usize) -> Vec<Vec<f64>> {
-    let mut out = vec![Vec::with_capacity(n); 6];
-    for t in 0..n {
-        let (a, b) = (state[3][t], state[4][t]);
+fn six_dims(state: &[Vec<f64>]) -> Vec<Vec<f64>> {
+    let mut out = vec![Vec::new(); 6];
+    for (a, b) in state[3].iter().zip(&state[4]) {
         let rows = [a.cos(), a.sin(), 0.0, -a.sin() * b.cos(), a.cos() * b.cos(), b.sin()];
         rows.iter().zip(&mut out).for_each(|(v, dim)| dim.push(*v));
     }
