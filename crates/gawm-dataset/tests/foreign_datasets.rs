@@ -22,8 +22,8 @@ fn corpus(name: &str) -> Option<PathBuf> {
 /// Checks the codes of errors and warnings, which are all true of these datasets but for the last list.
 fn check_findings(name: &str, n_episodes: u64, n_rows: u64, expected: &[&str], false_alarms: &[&str]) {
     let Some(dir) = corpus(name) else { return };
-    let dataset = Dataset::open(&dir, ReadLimits::default()).unwrap();
-    let report = validate(&dataset, &ValidateOptions::default()).unwrap();
+    let dataset = Dataset::open(&dir, ReadLimits::default()).expect("the corpus opens");
+    let report = validate(&dataset, &ValidateOptions::default()).expect("the corpus is scanned");
     assert_eq!((report.episodes, report.rows), (n_episodes, n_rows));
     let mut codes: Vec<&str> =
         report.findings.iter().filter(|f| f.severity >= Severity::Warning).map(|f| f.code).collect();
