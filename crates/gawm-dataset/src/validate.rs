@@ -10,6 +10,7 @@ mod finding;
 mod group;
 mod image;
 mod layout;
+mod probe;
 mod profile;
 mod render;
 mod robust;
@@ -50,11 +51,18 @@ pub struct ValidateOptions {
     pub window_rows: usize,
     /// Whether pictures are looked at.
     pub checks_images: bool,
+    /// Whether a probe tests if pictures show the state (SEMANTIC-012).
+    pub probes_targets: bool,
 }
 
 impl Default for ValidateOptions {
     fn default() -> Self {
-        ValidateOptions { thresholds: Thresholds::default(), window_rows: 16, checks_images: true }
+        ValidateOptions {
+            thresholds: Thresholds::default(),
+            window_rows: 16,
+            checks_images: true,
+            probes_targets: false,
+        }
     }
 }
 
@@ -123,9 +131,12 @@ pub fn examine(dataset: &Dataset, options: &ValidateOptions) -> Result<Examinati
     findings.extend(semantic::judge(dataset, &plan, thresholds, &runs));
     findings.extend(split::judge(dataset, &plan, thresholds, &runs));
     if has_images {
-        let (found, defects) = image::judge(dataset, thresholds, &runs, |_| {});
-        findings.extend(found);
-        findings.extend(structure::judge_defects(dataset, &defects));
+        let judged = image::judge(dataset, thresholds, &runs, |_| {});
+        findings.extend(judged.findings);
+        findings.extend(structure::judge_defects(dataset, &judged.defects));
+        if options.probes_targets {
+            findings.extend(probe::judge(dataset, &plan, thresholds, &judged.pictures)?);
+        }
     }
     if options.checks_images {
         findings.extend(image::judge_videos(dataset));

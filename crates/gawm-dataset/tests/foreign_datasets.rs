@@ -61,10 +61,15 @@ fn statistics_agree_with_those_that_came_with_the_data() {
     for column in stats.columns.iter().filter(|c| c.name == "action" || c.name == "observation.state") {
         for (i, dim) in column.dims.iter().enumerate() {
             let summary = dim.values.summary();
-            for (key, value) in [("mean", summary.mean), ("std", summary.std), ("min", summary.min), ("max", summary.max)] {
+            for (key, value) in
+                [("mean", summary.mean), ("std", summary.std), ("min", summary.min), ("max", summary.max)]
+            {
                 let expected = stored[&column.name][key][i].as_f64().unwrap();
                 // The makers computed in single precision.
-                assert!((value - expected).abs() < 2e-4 * (1.0 + expected.abs()), "{key} {i}: {value} {expected}");
+                assert!(
+                    (value - expected).abs() < 2e-4 * (1.0 + expected.abs()),
+                    "{key} {i}: {value} {expected}"
+                );
             }
         }
     }

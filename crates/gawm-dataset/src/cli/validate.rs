@@ -35,6 +35,9 @@ pub(super) struct ValidateArguments {
     /// Plant defects in clean synthetic data, one at a time, and report which are found
     #[arg(long)]
     demo: bool,
+    /// Test with a linear probe whether the pictures show each state (SEMANTIC-012)
+    #[arg(long)]
+    probe: bool,
     /// Print all thresholds as TOML and stop
     #[arg(long)]
     print_rules: bool,
@@ -86,6 +89,7 @@ pub(super) fn run(arguments: &ValidateArguments, quiet: bool) -> Result<u8, Fail
         thresholds,
         window_rows: arguments.window.max(1),
         checks_images: !arguments.no_images,
+        probes_targets: arguments.probe,
     };
     let report = validate(&dataset, &options)?;
     let text = match arguments.format {

@@ -16,7 +16,7 @@ use crate::{
 /// Side of the thumbnails that frames are compared by.
 pub(super) const THUMB_SIDE: usize = 8;
 /// Pixels of a thumbnail.
-const THUMB: usize = THUMB_SIDE * THUMB_SIDE;
+pub(super) const THUMB: usize = THUMB_SIDE * THUMB_SIDE;
 /// Largest lag of pictures that is looked for, in rows.
 const MAX_LAG: usize = 12;
 
@@ -95,6 +95,11 @@ impl FrameReader for Measurer {
 }
 
 impl CameraRun {
+    /// Returns the thumbnail of a frame that is a picture.
+    pub(super) fn thumb(&self, row: usize) -> Option<&[u8; THUMB]> {
+        self.frames.get(row).filter(|f| f.is_picture).map(|f| &f.thumb)
+    }
+
     fn note_undecodable(&mut self, row: usize, reason: String) {
         self.n_undecodable += 1;
         if self.undecodable.len() < 4 {
@@ -103,16 +108,25 @@ impl CameraRun {
     }
 }
 
+/// What pictures gave.
+#[derive(Debug, Default)]
+pub(super) struct Judgement {
+    pub(super) findings: Vec<Finding>,
+    pub(super) defects: Vec<Defect>,
+    /// By run, the frames of each camera.
+    pub(super) pictures: Vec<(usize, Vec<CameraRun>)>,
+}
+
 /// Looks at all frames in the data files and judges them.
 pub(super) fn judge(
     dataset: &Dataset,
     thresholds: &Thresholds,
     runs: &[RunProfile],
     progress: impl Fn(usize) + Sync,
-) -> (Vec<Finding>, Vec<Defect>) {
+) -> Judgement {
     let cameras = dataset.image_columns();
     if cameras.is_empty() {
-        return (Vec::new(), Vec::new());
+        return Judgement::default();
     }
     let sizes: Vec<_> =
         cameras.iter().map(|c| dataset.info.feature(c).and_then(|f| f.image_size())).collect();
@@ -135,7 +149,7 @@ pub(super) fn judge(
         judge.lag(&mut findings);
     }
     exchanged(&cameras, &measured, &by_index, &mut findings);
-    (findings, defects)
+    Judgement { findings, defects, pictures: measured }
 }
 
 struct Judge<'a> {
@@ -290,8 +304,7 @@ impl Judge<'_> {
                 &camera.frames.iter().filter(|m| m.is_picture).map(|m| f64::from(f(m))).collect::<Vec<_>>(),
             )
         };
-        let measures: [(&str, Level); 2] =
-            [("brightness", |f| f.mean), ("contrast", |f| f.std)];
+        let measures: [(&str, Level); 2] = [("brightness", |f| f.mean), ("contrast", |f| f.std)];
         for (what, measure) in measures {
             let levels: Vec<f64> = self.runs.iter().map(|(_, c)| of(c, measure)).collect();
             let (centre, scale) = centre_and_scale(&levels);
