@@ -183,7 +183,13 @@ impl ColumnPlan {
         let names = layouts.iter().map(|l| l.name.clone()).collect::<Vec<_>>();
         ColumnPlan {
             name: name.to_owned(),
-            names: if names.len() == width { names } else { (0..width).map(|i| i.to_string()).collect() },
+            names: if names.len() == width {
+                names
+            } else {
+                (0..width)
+                    .map(|i| dataset.info.feature(name).map_or(String::new(), |f| f.dim_name(i)))
+                    .collect()
+            },
             units: (0..width).map(|i| layouts.get(i).map_or(String::new(), |l| l.unit.clone())).collect(),
             is_angle: (0..width).map(|i| layouts.get(i).is_some_and(|l| l.is_angle)).collect(),
             is_listed_per_episode: name == "action"

@@ -183,6 +183,7 @@ fn apply_schema(layout: &mut FeatureLayout, typed: &gawm_schema::Feature) {
 fn apply_names(layout: &mut FeatureLayout) {
     let lower: Vec<String> = layout.names.iter().map(|n| n.to_ascii_lowercase()).collect();
     let last = |i: usize| lower[i].rsplit(['.', '_', '/', ' ', '-']).next().unwrap_or("").to_owned();
+    let stem = |i: usize| lower[i].strip_suffix(&last(i)).unwrap_or("").to_owned();
     let width = lower.len();
     for i in 0..width {
         let ends = |k: usize, suffixes: &[&str]| (0..k).all(|j| i + j < width && last(i + j) == suffixes[j]);
@@ -193,12 +194,16 @@ fn apply_names(layout: &mut FeatureLayout) {
         {
             layout.groups.push(Group { kind: GroupKind::Quaternion, start: i });
         }
-        if (ends(2, &["sin", "cos"]) || ends(2, &["cos", "sin"])) && i + 1 < width {
+        // The cosine of one angle before the sine of the next is no point on the circle.
+        let is_free = layout.groups.iter().all(|g| g.start + g.kind.width() <= i);
+        let is_one_angle = i + 1 < width && stem(i) == stem(i + 1);
+        if is_free && is_one_angle && (ends(2, &["sin", "cos"]) || ends(2, &["cos", "sin"])) {
             layout.groups.push(Group { kind: GroupKind::SinCos, start: i });
         }
         let is_six = |j: usize| lower[j].contains("6d") || lower[j].contains("rot6");
+        let is_matrix = ends(6, &["r00", "r10", "r20", "r01", "r11", "r21"]);
         if i + 6 <= width
-            && (i..i + 6).all(is_six)
+            && (is_matrix || (i..i + 6).all(is_six))
             && layout.groups.iter().all(|g| g.start + g.kind.width() <= i)
         {
             layout.groups.push(Group { kind: GroupKind::SixD, start: i });
@@ -209,5 +214,37 @@ fn apply_names(layout: &mut FeatureLayout) {
     }
     for group in &layout.groups {
         layout.kinds[group.start..group.start + group.kind.width()].fill(DimKind::Rotation);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check_groups(names: &[&str], expected: &[(GroupKind, usize)]) {
+        let n = names.len();
+        let mut layout = FeatureLayout {
+            name: "x".into(),
+            purpose: Purpose::Other,
+            names: names.iter().map(|n| (*n).to_owned()).collect(),
+            kinds: vec![DimKind::Unknown; n],
+            units: vec![String::new(); n],
+            limits: vec![None; n],
+            groups: Vec::new(),
+            has_names: true,
+        };
+        apply_names(&mut layout);
+        let found: Vec<(GroupKind, usize)> = layout.groups.iter().map(|g| (g.kind, g.start)).collect();
+        assert_eq!(found, expected);
+    }
+
+    #[test]
+    fn names_tell_groups() {
+        use GroupKind::{Quaternion, SinCos, SixD};
+        check_groups(&["a.sin", "a.cos", "b.sin", "b.cos", "grip"], &[(SinCos, 0), (SinCos, 2)]);
+        check_groups(&["a.cos", "b.sin"], &[]);
+        check_groups(&["x", "tool.qx", "tool.qy", "tool.qz", "tool.qw"], &[(Quaternion, 1)]);
+        check_groups(&["t_quat.w", "t_quat.x", "t_quat.y", "t_quat.z"], &[(Quaternion, 0)]);
+        check_groups(&["r_6d_0", "r_6d_1", "r_6d_2", "r_6d_3", "r_6d_4", "r_6d_5"], &[(SixD, 0)]);
     }
 }
