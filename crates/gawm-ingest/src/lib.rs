@@ -6,6 +6,7 @@ pub mod cli;
 pub mod contract;
 pub mod decode;
 pub mod episodes;
+pub mod explain;
 pub mod inspect;
 pub mod log;
 pub mod records;

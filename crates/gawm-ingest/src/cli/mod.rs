@@ -3,6 +3,7 @@
 //! Results go to stdout, everything else to stderr. Exit codes: 0 clean; 1 failed, nothing usable; 2 bad arguments or
 //! contract; 3 finished, but a mapped stream lost data or an input was refused; 130 interrupted.
 
+mod explain;
 mod inspect;
 mod run;
 mod suggest;
@@ -57,6 +58,8 @@ enum Command {
     Suggest(suggest::SuggestArgs),
     /// Make a dataset of logs
     Run(run::RunArgs),
+    /// Show the raw messages, the rule and the encoding behind one number of a dataset
+    Explain(explain::ExplainArgs),
     /// Print a completion script for a shell
     Completions {
         /// The shell
@@ -95,6 +98,7 @@ pub fn main(args: impl IntoIterator<Item = OsString>) -> ExitCode {
         Command::Inspect(args) => inspect::run(args, &cli.global),
         Command::Suggest(args) => suggest::run(args, &cli.global),
         Command::Run(args) => run::run(args, &cli.global),
+        Command::Explain(args) => explain::run(args, &cli.global),
         Command::Completions { shell } => {
             clap_complete::generate(*shell, &mut Cli::command(), "gawm-ingest", &mut std::io::stdout());
             Ok(Exit::Clean)

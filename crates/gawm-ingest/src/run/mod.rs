@@ -5,6 +5,7 @@
 
 mod bind;
 mod block;
+mod calibration;
 mod error;
 mod gaps;
 mod picture;
@@ -23,6 +24,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use gawm_dataset::{DatasetSpec, DatasetSummary, DatasetWriter, WriteError, WriteMode};
 use gawm_schema::Schema;
 
+pub(crate) use block::decode_block;
 pub use bind::{BindError, Binding, BoundFeature, BoundStream, FeatureSource};
 pub use error::{Refusal, RunError};
 pub(crate) use picture::Picture;

@@ -16,7 +16,7 @@ use super::report::{AgeCounts, FileReport, FileStatus};
 use super::session::{Session, SessionRules};
 use super::sink::{EpisodeSink, SinkRules};
 use super::source::{OpenError, Source};
-use super::{Refusal, RunError, RunOptions, gaps, with_hint};
+use super::{Refusal, RunError, RunOptions, calibration, gaps, with_hint};
 use crate::align::Stop;
 use crate::contract::{CheckedContract, EpisodeRule, GapRule, StreamData};
 use crate::decode::SchemaLibrary;
@@ -250,7 +250,13 @@ fn write_episodes(
     sink.discarded = discarded;
     let mut session = Session::new(&rules, sink);
     pass(context, open, &log, &mut session)?;
-    Ok(outcome(context, open, path, session))
+    let camera_infos = std::mem::take(&mut session.camera_infos);
+    let mut outcome = outcome(context, open, path, session);
+    if outcome.file.status != FileStatus::Refused {
+        let kept = calibration::keep(contract, context.binding, open, &camera_infos, writer);
+        outcome.warnings.extend(kept.map_err(|source| RunError::Write { dir: PathBuf::new(), source })?);
+    }
+    Ok(outcome)
 }
 
 /// A table lists its episodes; `from = "file"` means those and not the whole file as one.
@@ -346,6 +352,12 @@ fn outcome(
         format!("{} at offset {}: {}", found.kind.as_str(), found.offset, found.detail)
     }));
     warnings.extend(gaps::describe(context.binding, &result.gaps, first_ns(open)));
+    if result.failed_pictures > 0 {
+        warnings.push(format!(
+            "{} images turned out to be damaged when they were converted; their rows hold the image before, not valid",
+            result.failed_pictures
+        ));
+    }
     if result.short_episodes > 0 {
         warnings.push(format!(
             "{} episodes with {} rows in all were shorter than min_frames or min_length_s and are left out",
@@ -372,7 +384,7 @@ fn outcome(
     }
     let status = match &error {
         Some(_) => FileStatus::Refused,
-        None if counts.has_loss() || has_lost_bytes => FileStatus::Loss,
+        None if counts.has_loss() || has_lost_bytes || result.failed_pictures > 0 => FileStatus::Loss,
         None => FileStatus::Ok,
     };
     let file = FileReport {

@@ -260,6 +260,14 @@ impl<'a, 's> Session<'a, 's> {
         self.counts.read(&name, 1);
         self.ordinal += 1;
         let window = self.rules.contract.disorder_window_ns;
+        if let Some(newest) = self.newest_log_ns
+            && message.log_ns.saturating_sub(newest) > self.rules.contract.max_gap_ns
+        {
+            let gap_s = message.log_ns.saturating_sub(newest) as f64 / 1e9;
+            self.warn(format!(
+                "log times jump forward by {gap_s:.3} s at {newest} ns ({name}): nothing is resampled across it"
+            ));
+        }
         self.newest_log_ns = Some(self.newest_log_ns.map_or(message.log_ns, |ns| ns.max(message.log_ns)));
         let recent = &mut self.recent[message.topic];
         let key = (message.log_ns, message.sequence, message.publish_ns, message.crc, message.length);

@@ -81,8 +81,8 @@ impl Source {
         Ok(Source::Log(Box::new(Log::open(path, &open_options(contract))?)))
     }
 
-    /// Returns the log, if it is one.
-    pub(crate) fn log(&self) -> Option<&Log> {
+    /// Returns the MCAP file, if it is one.
+    pub(crate) fn as_log(&self) -> Option<&Log> {
         match self {
             Source::Log(log) => Some(log),
             Source::Table(_) => None,

@@ -20,6 +20,9 @@ const MAX_WIDTH: usize = 1024;
 const MAX_STAMP_OFFSET_MS: f64 = 2_000.0;
 /// Ticks per second are not proposed above this: more rows than a model needs.
 const MAX_RATE_HZ: f64 = 50.0;
+/// Rates that sensors are set to.
+const USUAL_RATES_HZ: [f64; 14] =
+    [1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 24.0, 25.0, 30.0, 50.0, 60.0, 100.0, 200.0, 1000.0];
 /// Rows that a log should give at least.
 const MIN_ROWS: f64 = 20.0;
 
@@ -94,13 +97,16 @@ fn guess_topic(topic: &Topic, survey: &Survey, library: &SchemaLibrary) -> Guess
         Some(Err(reason)) => return Guess::Skip(reason),
         None => {}
     }
-    let messages: Vec<Value> = topic
-        .samples
-        .iter()
-        .filter_map(|sample| decode_to_json(&schema_of(&topic.channel), sample, library).ok())
-        .collect();
+    let mut failure = None;
+    let mut messages: Vec<Value> = Vec::new();
+    for sample in &topic.samples {
+        match decode_to_json(&schema_of(&topic.channel), sample, library) {
+            Ok(message) => messages.push(message),
+            Err(error) => failure = Some(error.to_string()),
+        }
+    }
     if messages.is_empty() {
-        return Guess::Skip("no message could be decoded".to_owned());
+        return Guess::Skip(format!("no message could be decoded: {}", failure.unwrap_or_default()));
     }
     let groups = joints(topic, &messages, survey).unwrap_or_else(|| numbers(topic, &messages));
     if groups.is_empty() { Guess::Skip("holds no numbers of fixed number".to_owned()) } else { Guess::Vectors(groups) }
@@ -134,17 +140,44 @@ fn is_camera(topic: &Topic, library: &SchemaLibrary) -> Option<Result<(), String
     named.then(|| Err(last.unwrap_or_else(|| "no image".to_owned())))
 }
 
+/// How a message pairs the names of joints with their positions.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum JointLayout<'a> {
+    /// Two arrays.
+    Parallel { key: &'static str, value: &'static str },
+    /// An array of structs with `name` and `position`.
+    Structs { list: &'a str },
+}
+
+fn joint_layout(topic: &Topic) -> Option<JointLayout<'_>> {
+    let has = |path: &str| topic.fields.iter().any(|field| field.path == path);
+    let parallel = [("name", "position"), ("joint_names", "positions"), ("names", "positions"), ("name", "positions")];
+    if let Some((key, value)) = parallel.into_iter().find(|(key, value)| has(&format!("{key}[]")) && has(&format!("{value}[]"))) {
+        return Some(JointLayout::Parallel { key, value });
+    }
+    topic.fields.iter().find_map(|field| {
+        let list = field.path.strip_suffix("[].name")?;
+        let is_plain = !list.contains(['.', '[']) && has(&format!("{list}[].position"));
+        is_plain.then_some(JointLayout::Structs { list })
+    })
+}
+
 /// Joint positions by name, when the message has parallel `name` and `position` arrays.
 fn joints(topic: &Topic, messages: &[Value], survey: &Survey) -> Option<Vec<Group>> {
-    let has = |path: &str| topic.fields.iter().any(|field| field.path == path);
-    let (key, value) = [("name", "position"), ("joint_names", "positions"), ("names", "positions"), ("name", "positions")]
-        .into_iter()
-        .find(|(key, value)| has(&format!("{key}[]")) && has(&format!("{value}[]")))?;
+    let layout = joint_layout(topic)?;
     let names_of = |message: &Value| -> Option<Vec<String>> {
-        let names = message.get(key)?.as_array()?;
-        let values = message.get(value)?.as_array()?;
-        let names: Vec<String> = names.iter().filter_map(|name| name.as_str().map(str::to_owned)).collect();
-        (names.len() == values.len() && !names.is_empty()).then_some(names)
+        let texts = |items: &[Value]| items.iter().filter_map(|name| name.as_str().map(str::to_owned)).collect();
+        let names: Vec<String> = match layout {
+            JointLayout::Parallel { key, value } => {
+                let names = message.get(key)?.as_array()?;
+                let values = message.get(value)?.as_array()?;
+                if names.len() == values.len() { texts(names) } else { return None }
+            }
+            JointLayout::Structs { list } => {
+                message.get(list)?.as_array()?.iter().filter_map(|item| Some(item.get("name")?.as_str()?.to_owned())).collect()
+            }
+        };
+        (!names.is_empty()).then_some(names)
     };
     let all: Vec<Vec<String>> = messages.iter().filter_map(names_of).collect();
     let first = all.first()?;
@@ -175,7 +208,11 @@ fn joints(topic: &Topic, messages: &[Value], survey: &Survey) -> Option<Vec<Grou
             None => (KindSpec::Angle, "rad", "positions of joints are angles in rad unless a URDF says otherwise"),
         };
         let limits = joint.and_then(|joint| joint.limits);
-        let field = format!("{value}[{key}=\"{}\"]", name.replace('\\', "\\\\").replace('"', "\\\""));
+        let quoted = name.replace('\\', "\\\\").replace('"', "\\\"");
+        let field = match layout {
+            JointLayout::Parallel { key, value } => format!("{value}[{key}=\"{quoted}\"]"),
+            JointLayout::Structs { list } => format!("{list}[name=\"{quoted}\"].position"),
+        };
         let is_same = groups.last().is_some_and(|group| {
             group.kind == kind && group.reason == reason && group.limits.is_empty() == limits.is_none()
         });
@@ -269,8 +306,11 @@ fn quaternion_at(fields: &[&FieldInfo]) -> Option<(&'static str, Vec<String>)> {
 fn fixed_path(field: &FieldInfo, messages: &[Value]) -> Option<(String, usize)> {
     match field.arrays.as_slice() {
         [] => {
-            let is_there = messages.iter().all(|message| is_number(crate::episodes::value_at(message, &field.path).as_ref()));
-            is_there.then(|| (field.path.clone(), 1))
+            let n = messages
+                .iter()
+                .filter(|message| is_number(crate::episodes::value_at(message, &field.path).as_ref()))
+                .count();
+            is_most(n, messages.len()).then(|| (field.path.clone(), 1))
         }
         [_] if field.path.ends_with("[]") => {
             let base = field.path.trim_end_matches("[]");
@@ -282,12 +322,17 @@ fn fixed_path(field: &FieldInfo, messages: &[Value]) -> Option<(String, usize)> 
                     items.iter().all(|item| is_number(Some(item))).then_some(items.len())
                 })
                 .collect();
-            let n = (*lengths.first()?)?;
-            (n > 0 && n <= MAX_WIDTH && lengths.iter().all(|length| *length == Some(n)))
-                .then(|| (format!("{base}[0:{n}]"), n))
+            let n = lengths.iter().flatten().max_by_key(|n| lengths.iter().filter(|other| **other == Some(**n)).count())?;
+            let same = lengths.iter().filter(|length| **length == Some(*n)).count();
+            (*n > 0 && *n <= MAX_WIDTH && is_most(same, lengths.len())).then(|| (format!("{base}[0:{n}]"), *n))
         }
         _ => None,
     }
+}
+
+/// A few damaged messages do not decide what a topic is.
+fn is_most(n: usize, all: usize) -> bool {
+    n > 0 && 10 * n >= 8 * all
 }
 
 /// Numbers, truth values, and the texts that stand for numbers which JSON does not have.
@@ -407,13 +452,13 @@ fn publish_or_log(topic: &Topic, otherwise: String) -> (String, String) {
 pub(crate) fn tolerance_of(topic: &Topic) -> (Option<f64>, String) {
     let rate = topic.rate_hz();
     let period = if rate > 0.0 { 1e3 / rate } else { 0.0 };
-    let is_regular = topic.messages >= 8 && period > 0.0 && topic.slow_ms() <= 8.0 * period;
+    let is_regular = topic.messages >= 8 && period > 0.0 && topic.slow_ms <= 8.0 * period;
     if !is_regular {
         return (None, format!("{} messages at no steady rate: the last one holds", topic.messages));
     }
-    let ms = (3.0 * period).max(2.0 * topic.slow_ms()).max(20.0);
+    let ms = (3.0 * period).max(2.0 * topic.slow_ms).max(20.0);
     let ms = if ms < 1000.0 { ms.ceil() } else { (ms / 100.0).ceil() * 100.0 };
-    (Some(ms), format!("{rate:.4} Hz, 1 % of the intervals over {:.1} ms", topic.slow_ms()))
+    (Some(ms), format!("{rate:.2} Hz, 1 % of the intervals over {:.1} ms", topic.slow_ms))
 }
 
 fn base_stream(topic: &Topic, feature: &str, role: RoleSpec) -> (StreamSpec, Vec<String>) {
@@ -576,9 +621,10 @@ fn add_actions(suggestion: &mut Suggestion, found: &[(&Topic, Guess)]) {
 }
 
 fn add_camera(suggestion: &mut Suggestion, topic: &Topic, survey: &Survey) {
-    let generic = ["image", "compressed", "raw", "color", "rgb", "camera", "cam", "video"];
-    let words = names::words(&topic.channel.topic);
-    let kept: Vec<String> = words.iter().filter(|word| !generic.contains(&word.as_str())).cloned().collect();
+    let generic = ["image", "compressed", "compresseddepth", "raw", "color", "rgb", "camera", "cam", "video", "format"];
+    let words = names::words(&topic.channel.topic.replace("compressedDepth", "depth"));
+    let mut kept: Vec<String> = words.iter().filter(|word| !generic.contains(&word.as_str())).cloned().collect();
+    kept.dedup();
     let mut name = if kept.is_empty() { "camera".to_owned() } else { kept.join("_") };
     let taken = |name: &str, streams: &[StreamSpec]| {
         streams.iter().any(|stream| stream.feature == format!("observation.images.{name}"))
@@ -655,9 +701,11 @@ fn set_rate(suggestion: &mut Suggestion, survey: &Survey) {
         let topic = survey.topics.get(stream.topic.as_deref()?)?;
         (topic.rate_hz() > 0.0 && stream.tolerance_ms.is_some()).then(|| topic.rate_hz())
     };
+    let is_depth = |stream: &StreamSpec| stream.feature.contains("depth");
     let slowest = |role: RoleSpec| {
-        let rates = suggestion.contract.stream.iter().filter(|stream| stream.role == Some(role)).filter_map(rate_of);
-        rates.reduce(f64::min)
+        let own = suggestion.contract.stream.iter().filter(|stream| stream.role == Some(role));
+        let colour = own.clone().filter(|stream| !is_depth(stream)).filter_map(rate_of).reduce(f64::min);
+        colour.or(own.filter_map(rate_of).reduce(f64::min))
     };
     let fastest = suggestion.contract.stream.iter().filter_map(rate_of).reduce(f64::max);
     let (mut rate, mut reason) = match (slowest(RoleSpec::Image), slowest(RoleSpec::State)) {
@@ -677,8 +725,10 @@ fn set_rate(suggestion: &mut Suggestion, survey: &Survey) {
             rate = state;
         }
     }
-    // Integers are what LeRobot stores: the nearest where it is within 5 %, else the next below.
-    let rounded = if (rate.round() / rate - 1.0).abs() <= 0.05 { rate.round() } else { rate.floor() };
+    // Integers are what LeRobot stores: a usual rate or the nearest where it is within 5 %, else the next below.
+    let usual = USUAL_RATES_HZ.into_iter().find(|usual| (usual / rate - 1.0).abs() <= 0.05);
+    let near = (rate.round() / rate - 1.0).abs() <= 0.05;
+    let rounded = usual.unwrap_or(if near { rate.round() } else { rate.floor() });
     let (rate_hz, fps) = if rounded >= 1.0 { (rounded, None) } else { ((rate * 1e4).round().max(100.0) / 1e4, Some(1)) };
     suggestion.contract.ticks = TicksSpec { mode: TickMode::Fixed, rate_hz: Some(rate_hz), fps, stream: None };
     suggestion.reasons.insert("ticks", vec![reason]);

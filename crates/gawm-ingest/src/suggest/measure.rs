@@ -159,7 +159,7 @@ fn time_actions(suggestion: &mut Suggestion, survey: &Survey, series: &StreamSer
         let reasons = &mut suggestion.stream_reasons[index];
         let topic = stream.topic.as_deref().and_then(|topic| survey.topics.get(topic));
         let rate_hz = topic.map_or(0.0, super::survey::Topic::rate_hz);
-        apply(stream, reasons, &found, columns.len(), &kinds, rate_hz / tick_hz);
+        apply(stream, reasons, &found, columns.len(), &kinds, (rate_hz, tick_hz));
     }
 }
 
@@ -184,8 +184,9 @@ fn apply(
     found: &[(usize, Following)],
     n_columns: usize,
     kinds: &[(KindSpec, Option<Wrap>, Option<String>)],
-    commands_per_tick: f64,
+    (rate_hz, tick_hz): (f64, f64),
 ) {
+    let commands_per_tick = rate_hz / tick_hz;
     let name = stream.topic.clone().unwrap_or_default();
     let is_delta = super::names::is_delta(&name);
     let n_velocity = found.iter().filter(|(_, following)| following.is_velocity).count();
@@ -194,7 +195,9 @@ fn apply(
     if is_told {
         let mut lags: Vec<f64> = found.iter().map(|(_, following)| following.lag_s * 1e3).collect();
         lags.sort_by(f64::total_cmp);
-        let lag_ms = lags[lags.len() / 2];
+        // A step acts over the period after its command, so what is measured is later by half a period.
+        let half_ms = if is_delta && rate_hz > 0.0 { 500.0 / rate_hz } else { 0.0 };
+        let lag_ms = (lags[lags.len() / 2] - half_ms).max(0.0);
         let correlation = found.iter().map(|(_, f)| f.correlation).fold(f64::INFINITY, f64::min);
         let what = if is_delta { "step" } else if is_velocity { "velocity" } else { "position" };
         stream.offset_ms = if lag_ms >= 1.0 { (lag_ms * 10.0).round() / 10.0 } else { 0.0 };

@@ -1,5 +1,6 @@
 //! What logs hold, as far as a contract needs it.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -9,11 +10,15 @@ use bytes::Bytes;
 use super::SuggestError;
 use crate::decode::{Decoded, DecodePlan, FieldInfo, RowSink, SchemaLibrary, StampSource, sample_fields};
 use crate::inspect::{ChannelProbe, ChannelReport, MessageProbe, inspect_log};
-use crate::log::{Channel, Log, OpenOptions, discover};
+use crate::log::{Channel, Log, OpenOptions, decompress_message, discover, looks_like_zstd};
 use crate::run::{OpenRecording, Source, schema_of};
 
 /// Payloads that are kept per topic.
 const SAMPLES: usize = 48;
+/// Times per topic that are looked at.
+const MAX_TIMES: usize = 400_000;
+/// Largest message body that is unpacked.
+const MAX_BODY_BYTES: u64 = 256 << 20;
 /// Larger payloads are kept twice only.
 const LARGE_BYTES: usize = 1 << 16;
 
@@ -75,19 +80,16 @@ pub(crate) struct Topic {
     pub(crate) samples: Vec<Bytes>,
     /// First and last log time in the first recording.
     pub(crate) span_ns: (i64, i64),
+    /// Median interval by publish time, in order of time, in ms; 0 when there is none.
+    pub(crate) period_ms: f64,
+    /// The interval that one percent of the messages exceed, in ms.
+    pub(crate) slow_ms: f64,
 }
 
 impl Topic {
-    /// Returns messages per second.
+    /// Returns messages per second, 0 when that cannot be told.
     pub(crate) fn rate_hz(&self) -> f64 {
-        let rate = self.report.publish_rate.as_ref().filter(|_| self.report.has_publish_clock);
-        rate.or(self.report.rate.as_ref()).map_or(0.0, |rate| rate.median_hz)
-    }
-
-    /// Returns the interval that one percent of the messages exceed, in ms.
-    pub(crate) fn slow_ms(&self) -> f64 {
-        let rate = self.report.publish_rate.as_ref().filter(|_| self.report.has_publish_clock);
-        rate.or(self.report.rate.as_ref()).map_or(0.0, |rate| if rate.min_hz > 0.0 { 1e3 / rate.min_hz } else { 0.0 })
+        if self.period_ms > 0.0 { 1e3 / self.period_ms } else { 0.0 }
     }
 
     pub(crate) fn type_name(&self) -> &str {
@@ -119,12 +121,16 @@ pub(crate) fn survey(inputs: &[PathBuf], library: &SchemaLibrary, options: &Open
         let sources = logs.into_iter().map(|log| Source::Log(Box::new(log))).collect();
         let open = OpenRecording::of(recording.name.clone(), sources);
         let mut seen: BTreeMap<String, Topic> = BTreeMap::new();
-        for log in open.logs.iter().filter_map(Source::log) {
+        for log in open.logs.iter().filter_map(Source::as_log) {
             for report in inspect_log(log, log.path(), &probe).channels {
                 add_report(&mut seen, report, &open);
             }
         }
-        steps.look(&open);
+        for (name, (period_ms, slow_ms)) in steps.look(&open) {
+            if let Some(topic) = seen.get_mut(&name) {
+                (topic.period_ms, topic.slow_ms) = (period_ms, slow_ms);
+            }
+        }
         for (name, topic) in seen {
             topics.entry(name).and_modify(|known| {
                 known.messages += topic.messages;
@@ -172,6 +178,8 @@ fn add_report(seen: &mut BTreeMap<String, Topic>, report: ChannelReport, open: &
                 fields: Vec::new(),
                 samples: Vec::new(),
                 span_ns,
+                period_ms: 0.0,
+                slow_ms: 0.0,
                 report,
             };
             seen.insert(topic.report.topic.clone(), topic);
@@ -191,9 +199,9 @@ fn collect_samples(open: &OpenRecording, topics: &mut BTreeMap<String, Topic>, l
             let every = (topic.messages / SAMPLES as u64).max(1);
             let is_wanted = count.is_multiple_of(every) && topic.samples.len() < SAMPLES;
             *count += 1;
-            let payload = block.payload(message);
+            let payload = unpacked(channel, block.payload(message));
             if is_wanted && (payload.len() < LARGE_BYTES || topic.samples.len() < 2) {
-                topic.samples.push(Bytes::copy_from_slice(payload));
+                topic.samples.push(Bytes::from(payload.into_owned()));
             }
         }
     }
@@ -204,6 +212,17 @@ fn collect_samples(open: &OpenRecording, topics: &mut BTreeMap<String, Topic>, l
     }
 }
 
+/// Returns a message body; rosbag2 may have compressed each by itself.
+fn unpacked<'a>(channel: &Channel, payload: &'a [u8]) -> Cow<'a, [u8]> {
+    if channel.message_encoding == "cdr"
+        && looks_like_zstd(payload)
+        && let Ok(bytes) = decompress_message(payload, MAX_BODY_BYTES)
+    {
+        return Cow::Owned(bytes);
+    }
+    Cow::Borrowed(payload)
+}
+
 /// Steps back in the log times of single topics.
 #[derive(Default)]
 struct Steps {
@@ -211,52 +230,82 @@ struct Steps {
     largest_disorder_ms: f64,
 }
 
+/// Times of one message: log and publish.
+type Times = (i64, i64);
+
+/// Messages after a step back that must go on from there for it to be a reset.
+const RESET_RUN: usize = 8;
+
 impl Steps {
-    /// A step back is a reset when the topic then goes on from there, over times that it has been through before.
-    fn look(&mut self, open: &OpenRecording) {
-        let mut times: BTreeMap<String, Vec<i64>> = BTreeMap::new();
-        for (part, log) in open.logs.iter().filter_map(Source::log).enumerate() {
-            if log.channels().len() > 10_000 || part > 64 {
-                continue;
-            }
+    /// Looks at the times of a recording in the order of the file; returns period and slow interval of each topic.
+    fn look(&mut self, open: &OpenRecording) -> BTreeMap<String, (f64, f64)> {
+        let mut times: BTreeMap<String, Vec<Times>> = BTreeMap::new();
+        for log in open.logs.iter().filter_map(Source::as_log) {
             for block in log.blocks_in_file_order() {
                 let block = log.read_block(&block);
                 for message in &block.messages {
                     let topic = &block.channel(message).topic;
-                    let ns = i64::try_from(message.log_time_ns).unwrap_or(i64::MAX);
+                    let ns = |time: u64| i64::try_from(time).unwrap_or(i64::MAX);
+                    let publish = if message.publish_time_ns == 0 { message.log_time_ns } else { message.publish_time_ns };
+                    let pair = (ns(message.log_time_ns), ns(publish));
                     match times.get_mut(topic) {
-                        Some(times) if times.len() < 200_000 => times.push(ns),
+                        Some(times) if times.len() < MAX_TIMES => times.push(pair),
                         Some(_) => {}
                         None => {
-                            times.insert(topic.clone(), vec![ns]);
+                            times.insert(topic.clone(), vec![pair]);
                         }
                     }
                 }
             }
         }
-        for times in times.values() {
-            self.look_at(times);
-        }
+        times.into_iter().map(|(topic, times)| (topic, self.look_at(&times))).collect()
     }
 
-    fn look_at(&mut self, times: &[i64]) {
+    /// A step back is a reset when the topic then goes on from there, over times that it has been through before; or
+    /// when it goes back to where an earlier reset went.
+    fn look_at(&mut self, times: &[Times]) -> (f64, f64) {
+        let log = |index: usize| times[index].0;
+        let mut steps = Vec::new();
         let mut newest = i64::MIN;
-        for (index, &ns) in times.iter().enumerate() {
-            if ns >= newest {
-                newest = ns;
-                continue;
+        for index in 0..times.len() {
+            if log(index) < newest {
+                let run = (index + 1..times.len()).take_while(|&at| log(at) >= log(at - 1) && log(at) < newest).count();
+                steps.push((index, newest.saturating_sub(log(index)) as f64 / 1e6, run));
+                if run >= RESET_RUN {
+                    newest = log(index);
+                }
             }
-            let back_ms = newest.saturating_sub(ns) as f64 / 1e6;
-            let after = &times[index..times.len().min(index + 4)];
-            let goes_on = after.windows(2).all(|pair| pair[1] >= pair[0])
-                && after.iter().all(|&ns| ns < newest)
-                && after.len() >= 3;
-            if goes_on {
+            newest = newest.max(log(index));
+        }
+        let restarts: Vec<i64> = steps.iter().filter(|step| step.2 >= RESET_RUN).map(|step| log(step.0)).collect();
+        let mut resets = Vec::new();
+        for &(index, back_ms, run) in &steps {
+            let is_known = restarts.iter().any(|&ns| (log(index) - ns).abs() < 1_000_000);
+            if run >= RESET_RUN || is_known {
                 self.smallest_reset_ms = Some(self.smallest_reset_ms.map_or(back_ms, |ms| ms.min(back_ms)));
-                newest = ns;
+                resets.push(index);
             } else {
                 self.largest_disorder_ms = self.largest_disorder_ms.max(back_ms);
             }
         }
+        intervals(times, &resets)
     }
+}
+
+/// Returns the median interval and the one that a percent exceed, in ms, by publish time and within clock segments.
+fn intervals(times: &[Times], resets: &[usize]) -> (f64, f64) {
+    let mut all = Vec::new();
+    let mut ends = resets.to_vec();
+    ends.push(times.len());
+    let mut start = 0;
+    for end in ends {
+        let mut publish: Vec<i64> = times[start..end].iter().map(|pair| pair.1).collect();
+        publish.sort_unstable();
+        publish.dedup();
+        all.extend(publish.windows(2).map(|pair| (pair[1] - pair[0]) as f64 / 1e6));
+        start = end;
+    }
+    all.sort_by(f64::total_cmp);
+    let at = |share: f64| all.get(((all.len().saturating_sub(1)) as f64 * share).round() as usize).copied().unwrap_or(0.0);
+    (at(0.5), at(0.99))
 }

@@ -24,7 +24,7 @@ pub(crate) struct Joint {
 /// Returns the texts of robot descriptions in attachments and topics.
 pub(crate) fn texts(open: &OpenRecording, topics: &BTreeMap<String, Topic>, library: &SchemaLibrary) -> Vec<String> {
     let mut texts = Vec::new();
-    for log in open.logs.iter().filter_map(Source::log) {
+    for log in open.logs.iter().filter_map(Source::as_log) {
         texts.extend(of_log(log));
     }
     for topic in topics.values().filter(|topic| topic.channel.topic.ends_with("robot_description")) {
