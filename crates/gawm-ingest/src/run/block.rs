@@ -71,7 +71,8 @@ pub(crate) fn decode_block(log: &Log, block: &BlockRef, plans: &Plans) -> Decode
         match plan.topic {
             None => unmapped[channel] += 1,
             Some(topic) => {
-                let decoded = decode_message(&read, message, plan, topic, plans, &mut sinks[channel], &mut out.values);
+                let decoded =
+                    decode_message(&read, message, plan, topic, plans, &mut sinks[channel], &mut out.values);
                 out.messages.push(decoded);
             }
         }
@@ -184,7 +185,8 @@ fn fill(
     if let Some(image) = &plan.image {
         let message = image.extract(payload, &mut RowSink::new()).map_err(|error| loss_of(&error))?;
         let stamp_ns = message.stamp_ns;
-        let picture = Picture::new(&message, image.kind(), |data| whole.keep(data)).map_err(|error| picture_loss(&error))?;
+        let picture = Picture::new(&message, image.kind(), |data| whole.keep(data))
+            .map_err(|error| picture_loss(&error))?;
         out.picture = Some((picture, stamp_ns));
     }
     let topic = &plans.topics[out.topic];

@@ -94,7 +94,15 @@ pub fn run(options: &RunOptions<'_>, report: &mut Report) -> Result<RunOutcome, 
         report.files.push(FileReport::refused(error.path(), with_hint(&error.to_string(), error.hint())));
     }
     report.warnings.extend(options.contract.warnings.iter().cloned());
-    let mut run = Run { options, library, labels, pool, writer: None, ages: Vec::new(), is_new_folder: is_empty(options.out) };
+    let mut run = Run {
+        options,
+        library,
+        labels,
+        pool,
+        writer: None,
+        ages: Vec::new(),
+        is_new_folder: is_empty(options.out),
+    };
     for (index, recording) in recordings.iter().enumerate() {
         if let Some((shard, n)) = options.shard
             && index as u64 % n != shard
@@ -171,7 +179,8 @@ impl Run<'_> {
         self.prepare_writer(&schema, report)?;
         let Some(writer) = self.writer.as_mut() else { return Ok(FileReport::refused(&path, String::new())) };
         if let Some((place, expected, got)) = writer.schema().difference(&schema) {
-            let detail = format!("{place} differs from the recordings before: expected {expected}, got {got}");
+            let detail =
+                format!("{place} differs from the recordings before: expected {expected}, got {got}");
             let refusal = Refusal::OtherSchema { detail };
             return Ok(FileReport::refused(&path, with_hint(&refusal.to_string(), refusal.hint())));
         }

@@ -103,7 +103,9 @@ impl OpenRecording {
             if part == part_before {
                 before.clock_segment != block.clock_segment
             } else {
-                start(block).zip(newest_ns).is_some_and(|(start, newest)| start.saturating_add(window_ns) < newest)
+                start(block)
+                    .zip(newest_ns)
+                    .is_some_and(|(start, newest)| start.saturating_add(window_ns) < newest)
             }
         });
         // Within a segment blocks are sorted by start, so the next one with messages tells.
@@ -148,7 +150,9 @@ pub(crate) fn write(
         other => other,
     });
     match &result {
-        Ok(outcome) if outcome.file.status != FileStatus::Refused => writer.end_recording().map_err(to_dir)?,
+        Ok(outcome) if outcome.file.status != FileStatus::Refused => {
+            writer.end_recording().map_err(to_dir)?
+        }
         Ok(_) => writer.abort_recording().map_err(to_dir)?,
         Err(_) => {}
     }
@@ -159,9 +163,8 @@ fn recording_info(open: &OpenRecording) -> Result<RecordingInfo, RunError> {
     let mut files = Vec::new();
     let mut whole = blake3::Hasher::new();
     for log in &open.logs {
-        let hash = log
-            .content_hash()
-            .map_err(|source| RunError::Read { path: log.path().to_owned(), source })?;
+        let hash =
+            log.content_hash().map_err(|source| RunError::Read { path: log.path().to_owned(), source })?;
         whole.update(&hash);
         files.push(SourceFile {
             name: log.path().file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
@@ -311,9 +314,11 @@ fn outcome(
     if has_lost_bytes {
         count_damaged(open, &mut counts);
     }
-    warnings.extend(damage.iter().map(|found| {
-        format!("{} at offset {}: {}", found.kind.as_str(), found.offset, found.detail)
-    }));
+    warnings.extend(
+        damage
+            .iter()
+            .map(|found| format!("{} at offset {}: {}", found.kind.as_str(), found.offset, found.detail)),
+    );
     warnings.extend(gaps::describe(context.binding, &result.gaps, first_ns(open)));
     if result.short_episodes > 0 {
         warnings.push(format!(
@@ -322,7 +327,10 @@ fn outcome(
         ));
     }
     if !result.dropped_intervals.is_empty() {
-        warnings.push(format!("{} episodes were left out by gap = \"drop-episode\"", result.dropped_intervals.len()));
+        warnings.push(format!(
+            "{} episodes were left out by gap = \"drop-episode\"",
+            result.dropped_intervals.len()
+        ));
     }
     let mut error = None;
     if let Some(&stream) = empty.first() {
@@ -364,7 +372,9 @@ fn no_episode(result: &super::sink::SinkOutcome, warnings: &[String]) -> String 
         );
     }
     match warnings.last() {
-        Some(last) => format!("at no tick all required streams had a usable sample within an episode; last finding: {last}"),
+        Some(last) => format!(
+            "at no tick all required streams had a usable sample within an episode; last finding: {last}"
+        ),
         None => "at no tick all required streams had a usable sample within an episode".to_owned(),
     }
 }

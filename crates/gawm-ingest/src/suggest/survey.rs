@@ -7,7 +7,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 
 use super::SuggestError;
-use crate::decode::{Decoded, DecodePlan, FieldInfo, RowSink, SchemaLibrary, StampSource, sample_fields};
+use crate::decode::{DecodePlan, Decoded, FieldInfo, RowSink, SchemaLibrary, StampSource, sample_fields};
 use crate::inspect::{ChannelProbe, ChannelReport, MessageProbe, inspect_log};
 use crate::log::{Channel, Log, OpenOptions, discover};
 use crate::run::{OpenRecording, schema_of};
@@ -87,7 +87,8 @@ impl Topic {
     /// Returns the interval that one percent of the messages exceed, in ms.
     pub(crate) fn slow_ms(&self) -> f64 {
         let rate = self.report.publish_rate.as_ref().filter(|_| self.report.has_publish_clock);
-        rate.or(self.report.rate.as_ref()).map_or(0.0, |rate| if rate.min_hz > 0.0 { 1e3 / rate.min_hz } else { 0.0 })
+        rate.or(self.report.rate.as_ref())
+            .map_or(0.0, |rate| if rate.min_hz > 0.0 { 1e3 / rate.min_hz } else { 0.0 })
     }
 
     pub(crate) fn type_name(&self) -> &str {
@@ -96,7 +97,11 @@ impl Topic {
 }
 
 /// Looks at all logs.
-pub(crate) fn survey(inputs: &[PathBuf], library: &SchemaLibrary, options: &OpenOptions) -> Result<Survey, SuggestError> {
+pub(crate) fn survey(
+    inputs: &[PathBuf],
+    library: &SchemaLibrary,
+    options: &OpenOptions,
+) -> Result<Survey, SuggestError> {
     let found = discover(inputs);
     let mut reasons: Vec<String> = found.refused.iter().map(ToString::to_string).collect();
     let mut hint = found.refused.first().and_then(|error| error.hint());
@@ -125,10 +130,13 @@ pub(crate) fn survey(inputs: &[PathBuf], library: &SchemaLibrary, options: &Open
         }
         steps.look(&open);
         for (name, topic) in seen {
-            topics.entry(name).and_modify(|known| {
-                known.messages += topic.messages;
-                known.recordings += 1;
-            }).or_insert(topic);
+            topics
+                .entry(name)
+                .and_modify(|known| {
+                    known.messages += topic.messages;
+                    known.recordings += 1;
+                })
+                .or_insert(topic);
         }
         if first.is_none() {
             first = Some(open);
@@ -154,8 +162,11 @@ pub(crate) fn survey(inputs: &[PathBuf], library: &SchemaLibrary, options: &Open
 }
 
 fn add_report(seen: &mut BTreeMap<String, Topic>, report: ChannelReport, open: &OpenRecording) {
-    let channel = open.channels.iter().find(|channel| channel.topic == report.topic && channel.id == report.id);
-    let Some(channel) = channel.or(open.channels.iter().find(|channel| channel.topic == report.topic)) else { return };
+    let channel =
+        open.channels.iter().find(|channel| channel.topic == report.topic && channel.id == report.id);
+    let Some(channel) = channel.or(open.channels.iter().find(|channel| channel.topic == report.topic)) else {
+        return;
+    };
     let ns = |time: Option<u64>| time.and_then(|ns| i64::try_from(ns).ok());
     let span_ns = (ns(report.start_ns).unwrap_or(0), ns(report.end_ns).unwrap_or(0));
     match seen.get_mut(&report.topic) {
