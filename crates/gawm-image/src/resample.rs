@@ -21,12 +21,6 @@ pub(crate) fn bilinear<const C: usize>(values: &[u8], from: (usize, usize), to: 
 }
 
 /// Computes the windows of all target pixels along one side.
-#[expect(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    clippy::cast_precision_loss,
-    reason = "positions lie between 0 and the size of an image side"
-)]
 fn windows(from: usize, to: usize) -> Vec<Window> {
     let scale = from as f64 / to as f64;
     let support = scale.max(1.0);
@@ -45,7 +39,6 @@ fn windows(from: usize, to: usize) -> Vec<Window> {
         .collect()
 }
 
-#[expect(clippy::cast_sign_loss, clippy::cast_possible_truncation, reason = "clamped to 0..=255 first")]
 fn round(sum: i32) -> u8 {
     (sum >> PRECISION).clamp(0, 255) as u8
 }

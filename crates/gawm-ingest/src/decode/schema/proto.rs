@@ -105,15 +105,7 @@ fn absent_value(field: &FieldDescriptor) -> Option<f64> {
         Value::U32(v) => f64::from(v),
         Value::F32(v) => f64::from(v),
         Value::F64(v) => v,
-        #[expect(
-            clippy::cast_precision_loss,
-            reason = "a declared 64-bit default beyond 2^53 is widened as data is"
-        )]
         Value::I64(v) => v as f64,
-        #[expect(
-            clippy::cast_precision_loss,
-            reason = "a declared 64-bit default beyond 2^53 is widened as data is"
-        )]
         Value::U64(v) => v as f64,
         _ => 0.0,
     })

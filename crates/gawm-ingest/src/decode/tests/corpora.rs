@@ -208,7 +208,6 @@ fn arm_logs_equal_their_truth_in_every_encoding() {
         let mut expected = truth["action"].f64();
         if is_proto {
             // This writer's gripper is a 32-bit float.
-            #[expect(clippy::cast_possible_truncation, reason = "what the writer did")]
             expected.iter_mut().skip(6).step_by(7).for_each(|v| *v = f64::from(*v as f32));
         }
         check_same(&values, &expected, file);

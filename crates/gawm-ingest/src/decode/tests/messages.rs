@@ -43,7 +43,7 @@ pub(super) struct Cdr(Vec<u8>);
 
 impl Cdr {
     fn align(mut self, n: usize) -> Self {
-        while self.0.len() % n != 0 {
+        while !self.0.len().is_multiple_of(n) {
             self.0.push(0);
         }
         self
