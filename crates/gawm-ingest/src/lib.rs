@@ -11,3 +11,4 @@ pub mod log;
 pub mod records;
 pub mod run;
 pub mod suggest;
+pub mod tabular;

@@ -38,7 +38,7 @@ impl Linear {
         Ok(Linear { weight: parameters.get(&format!("{name}.weight"))?, bias })
     }
 
-    /// Makes a layer of a weight [outputs, inputs] and a bias [outputs].
+    /// Makes a layer of a weight [outputs, inputs] and a bias `[outputs]`.
     pub fn new(weight: Tensor, bias: Option<Tensor>) -> Linear {
         Linear { weight, bias }
     }

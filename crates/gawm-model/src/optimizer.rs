@@ -124,7 +124,7 @@ pub enum OptimizerError {
     },
     /// A moment of a saved state does not fit.
     #[error("optimiser state: {0}")]
-    State(#[from] ParameterError),
+    State(ParameterError),
     /// A saved state has only one of the two moments of a parameter.
     #[error("optimiser state of {name:?}: expected both moments, got one")]
     HalfMoment {
@@ -140,8 +140,14 @@ pub enum OptimizerError {
         got: f32,
     },
     /// candle failed.
-    #[error("tensor operation failed: {0}")]
+    #[error(transparent)]
     Candle(#[from] candle_core::Error),
+}
+
+impl From<ParameterError> for OptimizerError {
+    fn from(error: ParameterError) -> OptimizerError {
+        OptimizerError::State(error)
+    }
 }
 
 /// First and second moment of a gradient, f32.

@@ -107,7 +107,7 @@ pub enum ParameterError {
         got: f32,
     },
     /// candle failed.
-    #[error("tensor operation failed: {0}")]
+    #[error(transparent)]
     Candle(#[from] candle_core::Error),
 }
 

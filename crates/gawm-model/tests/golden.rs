@@ -1,4 +1,5 @@
 //! Parity with the published PyTorch modules, on the fixtures and on every file in `GAWM_GOLDEN_DIR`.
+#![expect(clippy::unwrap_used, reason = "a test ends where its helper does")]
 
 use std::path::{Path, PathBuf};
 
@@ -49,15 +50,4 @@ fn folder_of_the_environment() {
     files.sort();
     assert!(!files.is_empty(), "GAWM_GOLDEN_DIR holds no *.json");
     files.iter().for_each(|file| check_golden(file));
-}
-
-#[test]
-fn a_wrong_answer_is_found() {
-    let text = std::fs::read_to_string(fixture("small.json")).unwrap();
-    let mut json: serde_json::Value = serde_json::from_str(&text).unwrap();
-    let value = &mut json["grad"]["predictor.pos_embedding"]["head"][0];
-    *value = (value.as_f64().unwrap() + 0.1).into();
-    let report = compare(&Golden::parse(&json.to_string()).unwrap(), &Device::Cpu, Precision::F32).unwrap();
-    let failures: Vec<&str> = report.failures().map(|line| line.name.as_str()).collect();
-    assert_eq!(failures, ["grad.predictor.pos_embedding.head"]);
 }

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use bytes::Bytes;
-use gawm_ingest::inspect::{EncodingProbe, inspect_log};
+use gawm_ingest::inspect::{DecoderProbe, inspect_log};
 use gawm_ingest::log::{Log, OpenOptions};
 use libfuzzer_sys::fuzz_target;
 
@@ -22,5 +22,5 @@ fuzz_target!(|data: &[u8]| {
     for index in 0..log.attachments().len() {
         std::hint::black_box(log.read_attachment(index).is_ok());
     }
-    std::hint::black_box(inspect_log(&log, path, &EncodingProbe));
+    std::hint::black_box(inspect_log(&log, path, &DecoderProbe::default()));
 });

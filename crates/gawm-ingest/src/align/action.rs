@@ -7,13 +7,7 @@ use super::interpolate::{inverse, multiplied, push_rotation, quaternion, short_w
 use super::{Derivation, PartKind, Reduction};
 
 /// Appends one command made of several; `commands` holds `n` rows of the parts' width, in time order.
-pub(crate) fn reduced(
-    reduction: Reduction,
-    parts: &[PartKind],
-    commands: &[f64],
-    n: usize,
-    out: &mut Vec<f64>,
-) {
+pub(crate) fn reduced(reduction: Reduction, parts: &[PartKind], commands: &[f64], n: usize, out: &mut Vec<f64>) {
     let width = commands.len() / n.max(1);
     let mut at = 0;
     for part in parts {
@@ -28,10 +22,9 @@ pub(crate) fn reduced(
                 }
                 (Reduction::Mean, _) => out.push(column().map(|v| v[0]).sum::<f64>() / n as f64),
                 (Reduction::Compose { in_body_frame }, kind) if raw > 1 => {
-                    let total =
-                        column().filter_map(|v| quaternion(kind, v)).fold([0.0, 0.0, 0.0, 1.0], |sum, q| {
-                            if in_body_frame { multiplied(sum, q) } else { multiplied(q, sum) }
-                        });
+                    let total = column().filter_map(|v| quaternion(kind, v)).fold([0.0, 0.0, 0.0, 1.0], |sum, q| {
+                        if in_body_frame { multiplied(sum, q) } else { multiplied(q, sum) }
+                    });
                     push_rotation(kind, total, out);
                 }
                 (Reduction::Sum | Reduction::Compose { .. }, _) => out.push(column().map(|v| v[0]).sum()),
@@ -42,13 +35,7 @@ pub(crate) fn reduced(
 }
 
 /// Appends the action that leads from one state to the next.
-pub(crate) fn derived(
-    derivation: Derivation,
-    parts: &[PartKind],
-    now: &[f64],
-    next: &[f64],
-    out: &mut Vec<f64>,
-) {
+pub(crate) fn derived(derivation: Derivation, parts: &[PartKind], now: &[f64], next: &[f64], out: &mut Vec<f64>) {
     if derivation == Derivation::Next {
         return out.extend(next);
     }

@@ -4,8 +4,8 @@ use std::collections::VecDeque;
 
 use super::buffer::Buffer;
 use super::{
-    ActionTiming, AlignRule, FeatureRule, GapAction, Method, Reduction, SampleTime, StreamRule, Ticks,
-    action, interpolate,
+    ActionTiming, AlignRule, FeatureRule, GapAction, Method, Reduction, SampleTime, StreamRule, Ticks, action,
+    interpolate,
 };
 
 /// One aligned row.
@@ -314,12 +314,7 @@ impl<I: Clone> Aligner<I> {
                 buffer.barrier_ns = resumed_ns;
             }
             self.open_gap = None;
-            sink.gap(GapEvent {
-                stream: None,
-                last_ns,
-                resumed_ns: Some(resumed_ns),
-                rule: GapAction::Split,
-            });
+            sink.gap(GapEvent { stream: None, last_ns, resumed_ns: Some(resumed_ns), rule: GapAction::Split });
             self.state = State::Seek { from_ns: resumed_ns.max(from_ns) };
             return Step::Again;
         }
@@ -367,8 +362,7 @@ impl<I: Clone> Aligner<I> {
     /// Returns when samples resume, if all streams are silent for too long around a time.
     fn silence_around(&self, at_ns: i64) -> Option<i64> {
         let last = self.newest_at(at_ns)?;
-        let next =
-            self.buffers.iter().filter_map(|b| b.first_after(at_ns).map(|i| b.time(i).key_ns)).min()?;
+        let next = self.buffers.iter().filter_map(|b| b.first_after(at_ns).map(|i| b.time(i).key_ns)).min()?;
         (next.saturating_sub(last) > self.rule.max_gap_ns).then_some(next)
     }
 
@@ -408,8 +402,7 @@ impl<I: Clone> Aligner<I> {
         if let Some(timing) = rule.timing
             && timing != ActionTiming::InForce
         {
-            let has_next =
-                next.is_some_and(|ns| ns <= at_ns.saturating_add(self.period_ns) || self.period_ns == 0);
+            let has_next = next.is_some_and(|ns| ns <= at_ns.saturating_add(self.period_ns) || self.period_ns == 0);
             let may_hold = matches!(timing, ActionTiming::Resample(_))
                 || matches!(timing, ActionTiming::Reduce(Reduction::Last | Reduction::Mean));
             let held = may_hold && self.last_within(stream, at_ns).is_some();
@@ -487,8 +480,7 @@ impl<I: Clone> Aligner<I> {
         if !self.is_known_at(tick_ns, 0) {
             return Ok(Step::Wait);
         }
-        if self.is_final() && self.buffers.iter().all(|buffer| buffer.newest().is_none_or(|ns| ns < tick_ns))
-        {
+        if self.is_final() && self.buffers.iter().all(|buffer| buffer.newest().is_none_or(|ns| ns < tick_ns)) {
             self.end_episode(EndReason::EndOfData, sink);
             self.leave_interval();
             return Ok(Step::Again);
@@ -593,9 +585,7 @@ impl<I: Clone> Aligner<I> {
                     for &stream in streams {
                         if self.rule.streams[stream].timing.is_some() {
                             valid = false;
-                        } else if let Err(at) =
-                            self.observe_values(stream, tick_ns, &mut row, &mut valid, sink)
-                        {
+                        } else if let Err(at) = self.observe_values(stream, tick_ns, &mut row, &mut valid, sink) {
                             gap = Some(at);
                             break 'features;
                         }

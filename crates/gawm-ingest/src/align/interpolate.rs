@@ -104,9 +104,7 @@ pub(crate) fn quaternion(kind: Kind, v: &[f64]) -> Option<[f64; 4]> {
         Kind::Quaternion { order: QuaternionOrder::Xyzw } => normalise([v[0], v[1], v[2], v[3]]),
         Kind::Quaternion { order: QuaternionOrder::Wxyz } => normalise([v[1], v[2], v[3], v[0]]),
         Kind::Rotvec => normalise(quaternion_from_rotvec([v[0], v[1], v[2]])),
-        Kind::Euler { sequence } => {
-            Some(quaternion_from_matrix(&matrix_from_euler(sequence, [v[0], v[1], v[2]])))
-        }
+        Kind::Euler { sequence } => Some(quaternion_from_matrix(&matrix_from_euler(sequence, [v[0], v[1], v[2]]))),
         Kind::Matrix => {
             let matrix = std::array::from_fn(|i| v[i]);
             v.iter().all(|x| x.is_finite()).then(|| quaternion_from_matrix(&matrix))

@@ -19,6 +19,5 @@ mod tests;
 pub use aligner::{Aligner, EndReason, EpisodeStart, GapEvent, Late, Row, RowSink, Stop};
 pub use buffer::SampleTime;
 pub use spec::{
-    ActionTiming, AlignRule, Derivation, FeatureRule, GapAction, Method, PartKind, Reduction, StreamRule,
-    Ticks,
+    ActionTiming, AlignRule, Derivation, FeatureRule, GapAction, Method, PartKind, Reduction, StreamRule, Ticks,
 };

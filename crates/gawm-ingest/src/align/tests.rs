@@ -132,8 +132,7 @@ fn a_gap_splits_and_never_squeezes_time() {
 fn a_masked_gap_is_nan_and_a_masked_image_is_held() {
     let masked = StreamRule { gap: GapAction::Mask, ..stream(15) };
     let image = StreamRule { width: 0, parts: vec![], gap: GapAction::Mask, ..stream(15) };
-    let mut samples =
-        [steps(0, 0.0, 100.0, 10.0), steps(1, 0.0, 30.0, 10.0), steps(1, 70.0, 100.0, 10.0)].concat();
+    let mut samples = [steps(0, 0.0, 100.0, 10.0), steps(1, 0.0, 30.0, 10.0), steps(1, 70.0, 100.0, 10.0)].concat();
     samples.extend([(2, 0.0, 7.0), (2, 80.0, 8.0), (2, 90.0, 9.0), (2, 100.0, 10.0)]);
     let got = aligned(rule(vec![stream(15), masked, image], 100.0), &samples);
     assert_eq!(got.times_ms(), vec![(0..=100).step_by(10).collect::<Vec<_>>()]);
@@ -186,11 +185,7 @@ fn action_rule(timing: ActionTiming, tolerance_ms: i64) -> AlignRule {
     rule(vec![stream(25), action], 50.0)
 }
 
-fn actions(
-    timing: ActionTiming,
-    tolerance_ms: i64,
-    commands: &[(usize, f64, f64)],
-) -> (Vec<Vec<f64>>, Vec<bool>) {
+fn actions(timing: ActionTiming, tolerance_ms: i64, commands: &[(usize, f64, f64)]) -> (Vec<Vec<f64>>, Vec<bool>) {
     let samples = [steps(0, 0.0, 100.0, 20.0), commands.to_vec()].concat();
     let got = aligned(action_rule(timing, tolerance_ms), &samples);
     let values = got.values().into_iter().map(|row| row[1..].to_vec()).collect();
@@ -255,8 +250,7 @@ fn derived_actions_lead_to_the_next_state() {
 
 #[test]
 fn a_nan_command_is_kept_and_not_valid() {
-    let commands =
-        [(1, 0.0, 1.0), (1, 20.0, f64::NAN), (1, 40.0, f64::INFINITY), (1, 60.0, 4.0), (1, 80.0, f64::NAN)];
+    let commands = [(1, 0.0, 1.0), (1, 20.0, f64::NAN), (1, 40.0, f64::INFINITY), (1, 60.0, 4.0), (1, 80.0, f64::NAN)];
     let (values, valid) = actions(ActionTiming::InForce, 30, &commands);
     assert_eq!(format!("{values:?}"), "[[1.0], [NaN], [inf], [4.0], [NaN], [4.0]]");
     assert_eq!(valid, [true, false, false, true, false, false]);
@@ -281,8 +275,7 @@ fn marked_intervals_bound_the_rows() {
 fn reference_ticks_are_the_samples_of_a_stream() {
     let mut rule = rule(vec![stream(15), StreamRule { tolerance_ns: None, ..stream(0) }], 1.0);
     rule.ticks = Ticks::Reference { stream: 0 };
-    let samples =
-        [steps(1, 5.0, 300.0, 5.0), vec![(0, 3.0, 0.0), (0, 7.0, 1.0), (0, 19.0, 2.0), (0, 90.0, 3.0)]];
+    let samples = [steps(1, 5.0, 300.0, 5.0), vec![(0, 3.0, 0.0), (0, 7.0, 1.0), (0, 19.0, 2.0), (0, 90.0, 3.0)]];
     let got = aligned(rule, &samples.concat());
     assert_eq!(got.times_ms(), vec![vec![7, 19], vec![90]]);
     assert_eq!(got.values(), [[1.0, 5.0], [2.0, 15.0], [3.0, 90.0]]);
@@ -338,8 +331,7 @@ fn late_samples_are_refused_and_early_rows_are_not_held_back() {
 /// A random log: streams with jitter, disorder and pauses.
 fn random_log() -> impl Strategy<Value = Vec<(usize, f64, f64)>> {
     prop::collection::vec((0_usize..3, 0_u32..2_000_000), 1..200).prop_map(|samples| {
-        let mut samples: Vec<(usize, f64)> =
-            samples.into_iter().map(|(s, us)| (s, f64::from(us) / 1e3)).collect();
+        let mut samples: Vec<(usize, f64)> = samples.into_iter().map(|(s, us)| (s, f64::from(us) / 1e3)).collect();
         samples.sort_by(|a, b| a.1.total_cmp(&b.1));
         samples.into_iter().map(|(stream, ms)| (stream, ms, ms)).collect()
     })

@@ -52,11 +52,8 @@ pub(crate) fn run(args: &InspectArgs, global: &Global) -> Result<Exit, Failure> 
         .map_err(|error| Failure { code: 1, error: anyhow::Error::new(error), hint: None })?;
     let report = pool.install(|| inspect(&args.logs, &OpenOptions::default(), &probe));
     if args.format == Format::Json {
-        let text = serde_json::to_string_pretty(&report).map_err(|error| Failure {
-            code: 1,
-            error: anyhow::Error::new(error),
-            hint: None,
-        })?;
+        let text = serde_json::to_string_pretty(&report)
+            .map_err(|error| Failure { code: 1, error: anyhow::Error::new(error), hint: None })?;
         print(&(text + "\n"));
     } else {
         print(&render_text(&report));
@@ -64,11 +61,7 @@ pub(crate) fn run(args: &InspectArgs, global: &Global) -> Result<Exit, Failure> 
     if report.files.is_empty()
         && let Some(refused) = report.refused.first()
     {
-        return Err(Failure {
-            code: 1,
-            error: anyhow::anyhow!("{}", refused.error),
-            hint: refused.hint.clone(),
-        });
+        return Err(Failure { code: 1, error: anyhow::anyhow!("{}", refused.error), hint: refused.hint.clone() });
     }
     Ok(if report.has_loss() || !report.refused.is_empty() { Exit::Loss } else { Exit::Clean })
 }

@@ -16,13 +16,7 @@ use clap::{Args, CommandFactory, Parser, Subcommand};
 
 /// Turn robot and simulator logs into datasets that can be trained on
 #[derive(Debug, Parser)]
-#[command(
-    name = "gawm-ingest",
-    version,
-    propagate_version = true,
-    arg_required_else_help = true,
-    max_term_width = 120
-)]
+#[command(name = "gawm-ingest", version, propagate_version = true, arg_required_else_help = true, max_term_width = 120)]
 pub struct Cli {
     /// What to do.
     #[command(subcommand)]

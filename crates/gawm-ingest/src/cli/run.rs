@@ -72,8 +72,10 @@ pub(crate) fn run(args: &RunArgs, global: &Global) -> Result<Exit, Failure> {
     let Some(out) = args.out.as_deref() else { return Ok(Exit::Clean) };
     let interrupt = Arc::new(AtomicBool::new(false));
     let flag = Arc::clone(&interrupt);
-    ctrlc::set_handler(move || flag.store(true, std::sync::atomic::Ordering::Relaxed)).map_err(|error| {
-        Failure { code: 1, error: anyhow::Error::new(error).context("cannot watch for Ctrl-C"), hint: None }
+    ctrlc::set_handler(move || flag.store(true, std::sync::atomic::Ordering::Relaxed)).map_err(|error| Failure {
+        code: 1,
+        error: anyhow::Error::new(error).context("cannot watch for Ctrl-C"),
+        hint: None,
     })?;
     let bar = Bar::new(global);
     let options = RunOptions {
@@ -106,12 +108,8 @@ pub(crate) fn run(args: &RunArgs, global: &Global) -> Result<Exit, Failure> {
                 (true, false) => Ok(Exit::Loss),
                 (true, true) => Err(Failure {
                     code: 1,
-                    error: anyhow::anyhow!(
-                        "data of mapped streams was lost, or an input was refused, and --strict was given"
-                    ),
-                    hint: Some(
-                        "the report (--report R.json) names topic, reason and first example".to_owned(),
-                    ),
+                    error: anyhow::anyhow!("data of mapped streams was lost, or an input was refused, and --strict was given"),
+                    hint: Some("the report (--report R.json) names topic, reason and first example".to_owned()),
                 }),
             }
         }
@@ -157,10 +155,9 @@ pub(crate) fn from_contract(error: ContractError) -> Failure {
 pub(crate) fn failure(error: RunError) -> Failure {
     let (code, hint) = match &error {
         RunError::Write { source, .. } => match source {
-            WriteError::NotEmpty { .. } => (
-                2,
-                Some("choose another --out, or give --append to add to it, or --resume to go on".to_owned()),
-            ),
+            WriteError::NotEmpty { .. } => {
+                (2, Some("choose another --out, or give --append to add to it, or --resume to go on".to_owned()))
+            }
             WriteError::NoDataset { .. } | WriteError::Unfinished { .. } | WriteError::SpecChanged { .. } => {
                 (2, source.hint().map(str::to_owned))
             }

@@ -36,11 +36,7 @@ pub(crate) fn run(args: &SuggestArgs, _global: &Global) -> Result<Exit, Failure>
 pub(crate) fn library(folders: &[PathBuf]) -> Result<SchemaLibrary, Failure> {
     let mut library = SchemaLibrary::builtin();
     for folder in folders {
-        library.add_folder(folder).map_err(|error| Failure {
-            code: 2,
-            error: anyhow::Error::new(error),
-            hint: None,
-        })?;
+        library.add_folder(folder).map_err(|error| Failure { code: 2, error: anyhow::Error::new(error), hint: None })?;
     }
     Ok(library)
 }

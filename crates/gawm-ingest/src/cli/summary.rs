@@ -64,12 +64,7 @@ fn losses(text: &mut String, outcome: &RunOutcome) -> std::fmt::Result {
     let mut is_first = true;
     for file in &outcome.report.files {
         let lost = file.topics.iter().filter(|topic| topic.mapped).flat_map(|topic| {
-            topic.lost.iter().map(|lost| {
-                format!(
-                    "{}: {} of {} messages, {} ({})",
-                    topic.topic, lost.count, topic.read, lost.reason, lost.first
-                )
-            })
+            topic.lost.iter().map(|lost| format!("{}: {} of {} messages, {} ({})", topic.topic, lost.count, topic.read, lost.reason, lost.first))
         });
         let mut lines: Vec<String> = lost.collect();
         if let (FileStatus::Refused, Some(error)) = (file.status, &file.error) {

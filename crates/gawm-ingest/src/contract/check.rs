@@ -5,9 +5,8 @@ use std::collections::BTreeSet;
 use gawm_schema::{EulerSequence, Kind, Role, Unit, UnitConversion, Wrap};
 
 use super::{
-    ActionSpec, ActionTimingSpec, AlignSpec, Causal, Contract, ContractError, EpisodeSource, GapRule,
-    ImageSpec, KindSpec, MarkerValue, NonFiniteRule, ReduceSpec, RoleSpec, StreamSpec, TickMode,
-    TopicPattern,
+    ActionSpec, ActionTimingSpec, AlignSpec, Causal, Contract, ContractError, EpisodeSource, GapRule, ImageSpec,
+    KindSpec, MarkerValue, NonFiniteRule, ReduceSpec, RoleSpec, StreamSpec, TickMode, TopicPattern,
 };
 use crate::align::{ActionTiming, Derivation, Reduction};
 
@@ -284,9 +283,7 @@ impl Checker<'_> {
             TickMode::Reference => {
                 let names: Vec<&str> = streams.iter().filter_map(|stream| stream.name.as_deref()).collect();
                 match &ticks.stream {
-                    Some(name) if names.contains(&name.as_str()) => {
-                        Ok(TickRule::Reference { stream: name.clone() })
-                    }
+                    Some(name) if names.contains(&name.as_str()) => Ok(TickRule::Reference { stream: name.clone() }),
                     other => {
                         let expected = format!("the name of a stream, one of {names:?}");
                         let got = other.as_deref().unwrap_or("nothing");
@@ -296,8 +293,7 @@ impl Checker<'_> {
             }
             TickMode::Native => {
                 let is_state = |stream: &&CheckedStream| stream.role == Role::State && stream.topic.is_some();
-                let first =
-                    streams.iter().find(is_state).or_else(|| streams.iter().find(|s| s.topic.is_some()));
+                let first = streams.iter().find(is_state).or_else(|| streams.iter().find(|s| s.topic.is_some()));
                 match first.and_then(|stream| stream.name.clone()) {
                     Some(stream) => Ok(TickRule::Reference { stream }),
                     None => Err(self.value("ticks.mode", "a stream with one topic", "none", "")),
@@ -322,12 +318,7 @@ impl Checker<'_> {
             Some(text) => Ok(text.clone()),
             None => {
                 let mode = format!("{:?}", spec.from).to_lowercase();
-                Err(self.value(
-                    &format!("episodes.{key}"),
-                    &format!("a value, for from = {mode:?}"),
-                    "nothing",
-                    "",
-                ))
+                Err(self.value(&format!("episodes.{key}"), &format!("a value, for from = {mode:?}"), "nothing", ""))
             }
         };
         Ok(match spec.from {
@@ -398,12 +389,7 @@ impl Checker<'_> {
         Ok(stream)
     }
 
-    fn tolerance(
-        &self,
-        key: &str,
-        spec: &StreamSpec,
-        align: AlignSpec,
-    ) -> Result<Option<i64>, ContractError> {
+    fn tolerance(&self, key: &str, spec: &StreamSpec, align: AlignSpec) -> Result<Option<i64>, ContractError> {
         let key = format!("{key}.tolerance_ms");
         match spec.tolerance_ms {
             Some(ms) => {
@@ -418,39 +404,25 @@ impl Checker<'_> {
         }
     }
 
-    fn image_rule(
-        &self,
-        key: &str,
-        spec: &StreamSpec,
-        align: AlignSpec,
-    ) -> Result<StreamData, ContractError> {
+    fn image_rule(&self, key: &str, spec: &StreamSpec, align: AlignSpec) -> Result<StreamData, ContractError> {
         if !spec.fields.is_empty() {
             let got = format!("{} fields", spec.fields.len());
             return Err(self.value(&format!("{key}.fields"), "nothing for an image", &got, ""));
         }
         if matches!(align, AlignSpec::Linear | AlignSpec::Slerp) {
             let expected = "asof, hold or nearest: images are not interpolated";
-            return Err(self.value(
-                &format!("{key}.align"),
-                expected,
-                &format!("{align:?}").to_lowercase(),
-                "",
-            ));
+            return Err(self.value(&format!("{key}.align"), expected, &format!("{align:?}").to_lowercase(), ""));
         }
         let image = spec.image.clone().unwrap_or_default();
-        for (name, sizes) in
-            [("crop", image.crop.map(|[_, _, width, height]| [width, height])), ("resize", image.resize)]
-        {
+        for (name, sizes) in [
+            ("crop", image.crop.map(|[_, _, width, height]| [width, height])),
+            ("resize", image.resize),
+        ] {
             if let Some(sizes) = sizes
                 && sizes.iter().any(|size| !(1..=16_384).contains(size))
             {
                 let got = format!("{sizes:?}");
-                return Err(self.value(
-                    &format!("{key}.image.{name}"),
-                    "a width and height from 1 to 16384",
-                    &got,
-                    "",
-                ));
+                return Err(self.value(&format!("{key}.image.{name}"), "a width and height from 1 to 16384", &got, ""));
             }
         }
         if let Some(quality) = image.quality
@@ -464,15 +436,13 @@ impl Checker<'_> {
     fn derived_rule(&self, key: &str, spec: &StreamSpec, role: Role) -> Result<StreamData, ContractError> {
         let rule = spec.action.as_ref().filter(|rule| rule.timing == ActionTimingSpec::Derived);
         match rule {
-            Some(ActionSpec { from: Some(from), derived, .. }) if role == Role::Action => {
-                Ok(StreamData::Derived {
-                    from: from.clone(),
-                    derivation: match derived {
-                        Some(super::DerivedSpec::Difference) => Derivation::Difference,
-                        _ => Derivation::Next,
-                    },
-                })
-            }
+            Some(ActionSpec { from: Some(from), derived, .. }) if role == Role::Action => Ok(StreamData::Derived {
+                from: from.clone(),
+                derivation: match derived {
+                    Some(super::DerivedSpec::Difference) => Derivation::Difference,
+                    _ => Derivation::Next,
+                },
+            }),
             _ => {
                 let hint = "only a derived action has none: action = { timing = \"derived\", from = \"observation.state\" }";
                 Err(self.value(&format!("{key}.topic"), "a topic", "nothing", hint))
@@ -494,17 +464,12 @@ impl Checker<'_> {
         let kind = self.kind(key, spec)?;
         let unit = unit_of(spec, kind);
         if !unit.is_known {
-            warnings.push(format!(
-                "{key}.unit: {:?} is not a known unit; values are kept as they are",
-                unit.si.0
-            ));
+            warnings.push(format!("{key}.unit: {:?} is not a known unit; values are kept as they are", unit.si.0));
         }
         let is_rotation = kind.raw_width() > 1;
         let bad = match stream.align {
             AlignSpec::Linear if is_rotation => Some("slerp for rotations"),
-            AlignSpec::Slerp if !is_rotation => {
-                Some("linear; slerp is for quaternion, rotvec, euler and matrix")
-            }
+            AlignSpec::Slerp if !is_rotation => Some("linear; slerp is for quaternion, rotvec, euler and matrix"),
             AlignSpec::Linear if matches!(kind, Kind::Bool) => Some("hold, asof or nearest for truth values"),
             _ => None,
         };
@@ -521,12 +486,7 @@ impl Checker<'_> {
         let timing = match (stream.role, &spec.action) {
             (Role::Action, action) => Some(self.timing(key, action.as_ref(), kind)?),
             (_, Some(_)) => {
-                return Err(self.value(
-                    &format!("{key}.action"),
-                    "nothing: the role is not action",
-                    "a rule",
-                    "",
-                ));
+                return Err(self.value(&format!("{key}.action"), "nothing: the role is not action", "a rule", ""));
             }
             (_, None) => None,
         };
@@ -541,12 +501,7 @@ impl Checker<'_> {
         }))
     }
 
-    fn timing(
-        &self,
-        key: &str,
-        spec: Option<&ActionSpec>,
-        kind: Kind,
-    ) -> Result<ActionTiming, ContractError> {
+    fn timing(&self, key: &str, spec: Option<&ActionSpec>, kind: Kind) -> Result<ActionTiming, ContractError> {
         let Some(spec) = spec else {
             let expected = "how commands become actions: in-force, next, window or derived";
             let hint = "`gawm-ingest suggest LOG` proposes one from the measured delay of the robot";
@@ -555,9 +510,7 @@ impl Checker<'_> {
         match (spec.timing, spec.reduce, spec.n) {
             (ActionTimingSpec::InForce, None, None) => Ok(ActionTiming::InForce),
             (ActionTimingSpec::Next, None, None) => Ok(ActionTiming::Next),
-            (ActionTimingSpec::Window, None, Some(n)) if (1..=1000).contains(&n) => {
-                Ok(ActionTiming::Resample(n))
-            }
+            (ActionTimingSpec::Window, None, Some(n)) if (1..=1000).contains(&n) => Ok(ActionTiming::Resample(n)),
             (ActionTimingSpec::Window, Some(reduce), None) => Ok(ActionTiming::Reduce(match reduce {
                 ReduceSpec::Last => Reduction::Last,
                 ReduceSpec::Mean if kind.raw_width() > 1 => {
@@ -582,9 +535,7 @@ impl Checker<'_> {
                 let expected = "no topic and no fields for a derived action";
                 Err(self.value(&format!("{key}.action"), expected, "a topic", ""))
             }
-            _ => {
-                Err(self.value(&format!("{key}.action"), "n and reduce only with window", "one of them", ""))
-            }
+            _ => Err(self.value(&format!("{key}.action"), "n and reduce only with window", "one of them", "")),
         }
     }
 

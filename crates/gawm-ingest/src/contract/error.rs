@@ -47,10 +47,9 @@ impl ContractError {
             ContractError::Read { .. } => {
                 Some("write a first contract with `gawm-ingest suggest LOG > contract.toml`".to_owned())
             }
-            ContractError::Syntax { .. } => Some(
-                "docs/contract.md lists every key; `run --print-config` shows the resolved contract"
-                    .to_owned(),
-            ),
+            ContractError::Syntax { .. } => {
+                Some("docs/contract.md lists every key; `run --print-config` shows the resolved contract".to_owned())
+            }
             ContractError::Value { hint, .. } => (!hint.is_empty()).then(|| hint.clone()),
         }
     }

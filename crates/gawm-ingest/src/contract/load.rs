@@ -26,8 +26,10 @@ pub fn parse(text: &str, file: &str, overrides: &[String]) -> Result<Contract, C
         for text in overrides {
             apply(&mut root, prefix, text)?;
         }
-        toml::to_string(&root)
-            .map_err(|error| ContractError::Syntax { path: "--set".to_owned(), detail: error.to_string() })?
+        toml::to_string(&root).map_err(|error| ContractError::Syntax {
+            path: "--set".to_owned(),
+            detail: error.to_string(),
+        })?
     };
     let shown = if overrides.is_empty() { file.to_owned() } else { format!("{file} with --set") };
     if table.contains_key("ingest") {
@@ -44,10 +46,8 @@ pub fn parse(text: &str, file: &str, overrides: &[String]) -> Result<Contract, C
 
 /// Writes a contract with all its defaults.
 pub fn to_toml(contract: &Contract) -> Result<String, ContractError> {
-    toml::to_string(contract).map_err(|error| ContractError::Syntax {
-        path: "resolved contract".to_owned(),
-        detail: error.to_string(),
-    })
+    toml::to_string(contract)
+        .map_err(|error| ContractError::Syntax { path: "resolved contract".to_owned(), detail: error.to_string() })
 }
 
 fn syntax(file: &str, error: &toml::de::Error) -> ContractError {
@@ -82,15 +82,13 @@ fn apply(root: &mut toml::Value, prefix: &str, text: &str) -> Result<(), Contrac
             table.insert((*last).to_owned(), value);
             Ok(())
         }
-        toml::Value::Array(items) => {
-            match last.parse::<usize>().ok().and_then(|index| items.get_mut(index)) {
-                Some(item) => {
-                    *item = value;
-                    Ok(())
-                }
-                None => Err(fail(format!("no entry {last:?} in {key:?}"))),
+        toml::Value::Array(items) => match last.parse::<usize>().ok().and_then(|index| items.get_mut(index)) {
+            Some(item) => {
+                *item = value;
+                Ok(())
             }
-        }
+            None => Err(fail(format!("no entry {last:?} in {key:?}"))),
+        },
         _ => Err(fail(format!("{key:?} goes on below a plain value"))),
     }
 }
@@ -101,8 +99,7 @@ fn step<'a>(at: &'a mut toml::Value, part: &str) -> Option<&'a mut toml::Value> 
             Some(table.entry(part.to_owned()).or_insert_with(|| toml::Value::Table(toml::Table::new())))
         }
         toml::Value::Array(items) => {
-            let named =
-                items.iter().position(|item| item.get("name").and_then(toml::Value::as_str) == Some(part));
+            let named = items.iter().position(|item| item.get("name").and_then(toml::Value::as_str) == Some(part));
             let index = part.parse::<usize>().ok().or(named)?;
             items.get_mut(index)
         }

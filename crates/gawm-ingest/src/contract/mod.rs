@@ -17,7 +17,7 @@ pub use load::{load, parse, to_toml};
 pub use pattern::TopicPattern;
 pub use spec::{
     ActionSpec, ActionTimingSpec, AlignSpec, CalibrationSpec, CaptureLabel, Causal, ColumnLabel, Contract,
-    DeltaFrame, DerivedSpec, EpisodeSource, EpisodesSpec, GapRule, ImageFormat, ImageSpec, KindSpec,
-    LabelSource, LabelsSpec, MarkerValue, MetadataLabel, NonFiniteRule, ReduceSpec, RoleSpec, SplitSpec,
-    StreamSpec, TickMode, TicksSpec, TimeUnit, TopicLabel,
+    DeltaFrame, DerivedSpec, EpisodeSource, EpisodesSpec, GapRule, ImageFormat, ImageSpec, KindSpec, LabelSource,
+    LabelsSpec, MarkerValue, MetadataLabel, NonFiniteRule, ReduceSpec, RoleSpec, SplitSpec, StreamSpec, TickMode,
+    TicksSpec, TimeUnit, TopicLabel,
 };

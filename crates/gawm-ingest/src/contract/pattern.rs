@@ -49,9 +49,9 @@ impl TopicPattern {
     pub fn captures(&self, topic: &str) -> Option<Vec<String>> {
         match &self.regex {
             None => (self.text == topic).then(Vec::new),
-            Some(regex) => regex
-                .captures(topic)
-                .map(|found| found.iter().skip(1).flatten().map(|group| group.as_str().to_owned()).collect()),
+            Some(regex) => regex.captures(topic).map(|found| {
+                found.iter().skip(1).flatten().map(|group| group.as_str().to_owned()).collect()
+            }),
         }
     }
 }

@@ -167,16 +167,14 @@ impl Labels {
             LabelSource::Capture(source) => capture(&source.capture),
             LabelSource::Column(source) => {
                 let episode = self.spec.side_episode.as_deref().map(|column| (column, asked.number));
-                let row =
-                    self.side_file.as_ref()?.find(&recording.path, self.spec.side_key.as_deref(), episode)?;
+                let row = self.side_file.as_ref()?.find(&recording.path, self.spec.side_key.as_deref(), episode)?;
                 row.get(&source.column).cloned()
             }
             LabelSource::Metadata(source) => {
                 let own = asked.record.filter(|(name, _)| *name == source.metadata);
-                let any = recording
-                    .metadata
-                    .iter()
-                    .find(|(name, values)| *name == source.metadata && values.contains_key(&source.key));
+                let any = recording.metadata.iter().find(|(name, values)| {
+                    *name == source.metadata && values.contains_key(&source.key)
+                });
                 own.or(any)?.1.get(&source.key).cloned()
             }
             LabelSource::Topic(source) => {
@@ -187,9 +185,7 @@ impl Labels {
                     within.last()
                 } else {
                     let before = values.iter().rev().find(|(ns, _)| *ns <= asked.start_ns);
-                    before
-                        .filter(|(_, text)| !text.is_empty())
-                        .or(within.into_iter().find(|(_, t)| !t.is_empty()))
+                    before.filter(|(_, text)| !text.is_empty()).or(within.into_iter().find(|(_, t)| !t.is_empty()))
                 };
                 found.map(|(_, text)| text.clone())
             }
@@ -201,9 +197,7 @@ impl Labels {
         let own = self.spec.success_values.iter().find(|(value, _)| value.to_lowercase() == lower);
         match (own, lower.as_str()) {
             (Some((_, truth)), _) => Some(*truth),
-            (None, "true" | "1" | "1.0" | "yes" | "success" | "successful" | "succeeded" | "ok" | "pass") => {
-                Some(true)
-            }
+            (None, "true" | "1" | "1.0" | "yes" | "success" | "successful" | "succeeded" | "ok" | "pass") => Some(true),
             (None, "false" | "0" | "0.0" | "no" | "failure" | "fail" | "failed") => Some(false),
             _ => None,
         }
@@ -217,13 +211,7 @@ impl RecordingLabels {
     }
 
     /// Takes a message of a label topic.
-    pub fn take(
-        &mut self,
-        topic: &str,
-        fields: &[(String, String)],
-        time_ns: i64,
-        message: &serde_json::Value,
-    ) {
+    pub fn take(&mut self, topic: &str, fields: &[(String, String)], time_ns: i64, message: &serde_json::Value) {
         for (_, field) in fields.iter().filter(|(name, _)| name == topic) {
             if let Some(value) = value_at(message, field) {
                 let values = self.values.entry((topic.to_owned(), field.clone())).or_default();

@@ -42,8 +42,7 @@ impl SideFile {
             let is_log = match key_column {
                 None => true,
                 Some(column) => row.get(column).is_some_and(|name| {
-                    !name.is_empty()
-                        && (log.ends_with(name) || log.file_stem().is_some_and(|stem| stem == name.as_str()))
+                    !name.is_empty() && (log.ends_with(name) || log.file_stem().is_some_and(|stem| stem == name.as_str()))
                 }),
             };
             let is_episode = episode.is_none_or(|(column, number)| {
@@ -84,11 +83,7 @@ fn from_csv(text: &str) -> Result<SideFile, String> {
     for (index, record) in records.enumerate() {
         if record.len() != header.len() {
             let line = index + 2;
-            return Err(format!(
-                "record {line}: expected {} fields as in the header, got {}",
-                header.len(),
-                record.len()
-            ));
+            return Err(format!("record {line}: expected {} fields as in the header, got {}", header.len(), record.len()));
         }
         rows.push(header.iter().cloned().zip(record).collect());
     }

@@ -26,7 +26,7 @@ use crate::log::{
 use statistics::{ChannelStatistics, Digest};
 
 pub use clocks::ClockOffset;
-pub use probe::{ChannelProbe, EncodingProbe, MessageProbe, StampReader};
+pub use probe::{ChannelProbe, DecoderProbe, MessageProbe, StampReader};
 pub use report::{
     AttachmentReport, ChannelReport, FileReport, InspectReport, MetadataReport, Notice, NoticeKind,
     RecordingReport, Refusal,

@@ -1,5 +1,8 @@
 //! What inspection asks of the decoders.
 
+use std::cell::RefCell;
+
+use crate::decode::{ChannelSchema, DecodePlan, Decoded, RowSink, SchemaLibrary, channel_fields};
 use crate::log::Channel;
 
 /// Reads the header stamp of a payload in nanoseconds.
@@ -20,23 +23,44 @@ pub trait MessageProbe: Sync {
     fn probe(&self, channel: &Channel) -> ChannelProbe;
 }
 
-/// A probe that goes by the encodings' names alone and reads no stamps.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct EncodingProbe;
+/// Asks the decoders, with the message types that they are given.
+#[derive(Debug, Clone, Default)]
+pub struct DecoderProbe {
+    /// Types for channels without a schema.
+    pub library: SchemaLibrary,
+}
 
-impl MessageProbe for EncodingProbe {
+thread_local! {
+    /// Stamps are read one message at a time; the sink keeps its memory between them.
+    static SINK: RefCell<RowSink> = RefCell::new(RowSink::new());
+}
+
+impl MessageProbe for DecoderProbe {
     fn probe(&self, channel: &Channel) -> ChannelProbe {
-        let schema = channel.schema.as_deref().map_or("", |schema| schema.encoding.as_str());
-        let is_known = matches!(
-            (channel.message_encoding.as_str(), schema),
-            ("cdr", "ros2msg") | ("ros1", "ros1msg") | ("protobuf", "protobuf") | ("json", _)
-        );
-        let obstacle = (!is_known).then(|| {
-            format!(
-                "no decoder for message encoding {:?} with schema encoding {schema:?}",
-                channel.message_encoding
-            )
-        });
-        ChannelProbe { obstacle, stamp: None }
+        let schema = channel.schema.as_deref();
+        let about = ChannelSchema {
+            topic: &channel.topic,
+            message_encoding: &channel.message_encoding,
+            schema_name: schema.map_or("", |schema| &schema.name),
+            schema_encoding: schema.map_or("", |schema| &schema.encoding),
+            schema_data: schema.map_or(&[], |schema| &schema.data),
+        };
+        if let Err(error) = channel_fields(&about, &self.library) {
+            return ChannelProbe { obstacle: Some(error.to_string()), stamp: None };
+        }
+        let plan = DecodePlan::compile(&about, &[], &self.library).ok().filter(DecodePlan::has_stamp);
+        ChannelProbe { obstacle: None, stamp: plan.map(stamp_reader) }
     }
+}
+
+fn stamp_reader(plan: DecodePlan) -> StampReader {
+    Box::new(move |payload| {
+        SINK.with_borrow_mut(|sink| {
+            sink.clear();
+            match plan.decode(payload, sink) {
+                Ok(Decoded::Row { stamp_ns }) => stamp_ns,
+                _ => None,
+            }
+        })
+    })
 }

@@ -221,7 +221,7 @@ fn the_generated_arm_and_cell_logs_show_what_is_odd() {
     };
     let corpora = Path::new(&shared).join("corpora");
     let kinds_of = |name: &str| -> Vec<NoticeKind> {
-        let found = inspect(&[corpora.join(name)], &OpenOptions::default(), &EncodingProbe);
+        let found = inspect(&[corpora.join(name)], &OpenOptions::default(), &DecoderProbe::default());
         assert_eq!(found.files.len(), 1, "{name}: {:?}", found.refused);
         found.files[0].notices.iter().map(|notice| notice.kind).collect()
     };
@@ -231,6 +231,7 @@ fn the_generated_arm_and_cell_logs_show_what_is_odd() {
         ("generated/bad_out_of_order.mcap", NoticeKind::BackwardSteps),
         ("generated/bad_schema_change.mcap", NoticeKind::SeveralChannels),
         ("cart_pole/kill_me_pls.mcap", NoticeKind::BackwardSteps),
+        ("cell/cell_mixed_zstd.mcap", NoticeKind::ClockDrift),
         ("cell/odd_camera_dies.mcap", NoticeKind::EndsEarly),
         ("cell/odd_stall_burst.mcap", NoticeKind::Bunching),
         ("cell/odd_stall_lost.mcap", NoticeKind::Gap),

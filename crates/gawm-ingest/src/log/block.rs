@@ -76,6 +76,26 @@ pub struct BlockRef {
     pub(crate) part: BlockPart,
 }
 
+impl BlockRef {
+    /// Makes the reference of a block of rows: its number stands for its offset.
+    pub(crate) fn of_table(number: u64, bytes: u64, start_ns: Option<u64>, end_ns: Option<u64>) -> Self {
+        Self {
+            kind: BlockKind::Chunk,
+            offset: number,
+            length: 0,
+            compression: String::new(),
+            uncompressed_bytes: bytes,
+            start_ns,
+            end_ns,
+            channel_ids: None,
+            spans: None,
+            clock_segment: 0,
+            is_cut: false,
+            part: BlockPart::Whole,
+        }
+    }
+}
+
 /// The messages of a block that are read.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) enum BlockPart {

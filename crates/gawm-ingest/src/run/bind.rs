@@ -2,15 +2,15 @@
 
 use std::collections::BTreeMap;
 
-use gawm_schema::{
-    Dim, Feature, FeatureData, FloatType, ImageSpec, Kind, Part, Role, Schema, StreamInfo, Unit,
-};
+use gawm_schema::{Dim, Feature, FeatureData, FloatType, ImageSpec, Kind, Part, Role, Schema, StreamInfo, Unit};
 
 use super::{Refusal, RunError};
-use crate::align::{AlignRule, Derivation, FeatureRule, GapAction, Method, PartKind, StreamRule, Ticks};
+use crate::align::{
+    AlignRule, Derivation, FeatureRule, GapAction, Method, PartKind, StreamRule, Ticks,
+};
 use crate::contract::{
-    AlignSpec, CheckedContract, CheckedStream, Clock, GapRule, ImageRule, NonFiniteRule, StreamData,
-    TickRule, VectorRule,
+    AlignSpec, CheckedContract, CheckedStream, Clock, GapRule, ImageRule, NonFiniteRule, StreamData, TickRule,
+    VectorRule,
 };
 use crate::decode::{FieldPath, SchemaLibrary, Segment};
 use crate::log::Channel;
@@ -138,11 +138,9 @@ impl Binding {
             .map(|feature| match &feature.source {
                 FeatureSource::Streams(streams) => FeatureRule::Vector { streams: streams.clone() },
                 FeatureSource::Image(stream) => FeatureRule::Image { stream: *stream },
-                FeatureSource::Derived { from, derivation } => FeatureRule::Derived {
-                    from: *from,
-                    derivation: *derivation,
-                    parts: self.part_kinds(*from),
-                },
+                FeatureSource::Derived { from, derivation } => {
+                    FeatureRule::Derived { from: *from, derivation: *derivation, parts: self.part_kinds(*from) }
+                }
             })
             .collect();
         let ticks = match &contract.ticks {
@@ -191,20 +189,12 @@ impl Binding {
                 },
                 FeatureSource::Image(stream) => {
                     let size = sizes.get(stream).cloned();
-                    FeatureData::Image(size.unwrap_or(ImageSpec {
-                        height: 0,
-                        width: 0,
-                        channels: 3,
-                        depth: false,
-                    }))
+                    FeatureData::Image(size.unwrap_or(ImageSpec { height: 0, width: 0, channels: 3, depth: false }))
                 }
                 FeatureSource::Derived { from, derivation } => {
                     let FeatureSource::Streams(streams) = &self.features[*from].source else { continue };
                     let parts = self.parts(contract, &feature.name, streams)?;
-                    FeatureData::Vector {
-                        dtype: float_type(contract),
-                        parts: derived_parts(parts, *derivation),
-                    }
+                    FeatureData::Vector { dtype: float_type(contract), parts: derived_parts(parts, *derivation) }
                 }
             };
             features.push(Feature { name: feature.name.clone(), role: feature.role, data });
@@ -217,12 +207,7 @@ impl Binding {
         Ok(Schema { robot_type: contract.written.robot_type.clone(), rate_hz, features, streams })
     }
 
-    fn parts(
-        &self,
-        contract: &CheckedContract,
-        feature: &str,
-        streams: &[usize],
-    ) -> Result<Vec<Part>, RunError> {
+    fn parts(&self, contract: &CheckedContract, feature: &str, streams: &[usize]) -> Result<Vec<Part>, RunError> {
         let mut parts = Vec::new();
         let mut names: BTreeMap<String, usize> = BTreeMap::new();
         for &index in streams {
@@ -470,30 +455,21 @@ impl Context<'_> {
             None => binding.features.push(BoundFeature {
                 name: name.to_owned(),
                 role: stream.rule.role,
-                source: if is_image {
-                    FeatureSource::Image(index)
-                } else {
-                    FeatureSource::Streams(vec![index])
-                },
+                source: if is_image { FeatureSource::Image(index) } else { FeatureSource::Streams(vec![index]) },
             }),
             Some(feature) if feature.role != stream.rule.role => {
                 return Err(wrong("its streams have different roles"));
             }
-            Some(BoundFeature { source: FeatureSource::Streams(streams), .. }) if !is_image => {
-                streams.push(index)
-            }
+            Some(BoundFeature { source: FeatureSource::Streams(streams), .. }) if !is_image => streams.push(index),
             Some(_) => {
-                return Err(wrong(
-                    "an image feature has one stream; use {1} in the name where a pattern matches several topics",
-                ));
+                return Err(wrong("an image feature has one stream; use {1} in the name where a pattern matches several topics"));
             }
         }
         Ok(())
     }
 
     fn fill_columns(&self, rule: &VectorRule, stream: &mut BoundStream) -> Result<(), BindError> {
-        let parsed: Result<Vec<FieldPath>, _> =
-            rule.fields.iter().map(|text| text.parse::<FieldPath>()).collect();
+        let parsed: Result<Vec<FieldPath>, _> = rule.fields.iter().map(|text| text.parse::<FieldPath>()).collect();
         stream.fields = parsed.map_err(|source| RunError::Path {
             file: self.contract.file.clone(),
             stream: stream.name.clone(),
@@ -537,3 +513,4 @@ impl Context<'_> {
         Ok(())
     }
 }
+

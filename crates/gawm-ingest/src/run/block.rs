@@ -6,10 +6,10 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 
-use super::picture::{Picture, PictureError};
+use super::picture::{Picture, loss_reason};
 use super::plan::{ChannelPlan, Plans, Sinks, schema_of};
 use crate::decode::{CameraInfo, DecodeError, Decoded, RowSink, decode_to_json};
-use crate::log::{Block, BlockRef, Damage, Log, Message, decompress_message, looks_like_zstd};
+use crate::log::{Block, Damage, Message, decompress_message, looks_like_zstd};
 
 /// Largest message that a compressed message may become.
 const MAX_MESSAGE_BYTES: u64 = 1 << 30;
@@ -56,9 +56,8 @@ pub(crate) struct MessageLoss {
     pub(crate) detail: String,
 }
 
-/// Reads and decodes a block.
-pub(crate) fn decode_block(log: &Log, block: &BlockRef, plans: &Plans) -> DecodedBlock {
-    let read = log.read_block(block);
+/// Decodes a block.
+pub(crate) fn decode_block(read: Block, plans: &Plans) -> DecodedBlock {
     let mut out = DecodedBlock::default();
     let by_channel: Vec<Arc<ChannelPlan>> = read.channels.iter().map(|channel| plans.of(channel)).collect();
     let mut sinks: Vec<Vec<Sinks>> =
@@ -71,8 +70,7 @@ pub(crate) fn decode_block(log: &Log, block: &BlockRef, plans: &Plans) -> Decode
         match plan.topic {
             None => unmapped[channel] += 1,
             Some(topic) => {
-                let decoded =
-                    decode_message(&read, message, plan, topic, plans, &mut sinks[channel], &mut out.values);
+                let decoded = decode_message(&read, message, plan, topic, plans, &mut sinks[channel], &mut out.values);
                 out.messages.push(decoded);
             }
         }
@@ -186,7 +184,7 @@ fn fill(
         let message = image.extract(payload, &mut RowSink::new()).map_err(|error| loss_of(&error))?;
         let stamp_ns = message.stamp_ns;
         let picture = Picture::new(&message, image.kind(), |data| whole.keep(data))
-            .map_err(|error| picture_loss(&error))?;
+            .map_err(|error| MessageLoss { reason: loss_reason(&error), detail: error.to_string() })?;
         out.picture = Some((picture, stamp_ns));
     }
     let topic = &plans.topics[out.topic];
@@ -202,9 +200,5 @@ fn fill(
 }
 
 fn loss_of(error: &DecodeError) -> MessageLoss {
-    MessageLoss { reason: error.reason(), detail: error.to_string() }
-}
-
-fn picture_loss(error: &PictureError) -> MessageLoss {
     MessageLoss { reason: error.reason(), detail: error.to_string() }
 }

@@ -96,9 +96,7 @@ pub enum RunError {
         source: gawm_dataset::TrajectoryError,
     },
     /// A stream whose gap rule is `fail` has a gap.
-    #[error(
-        "{log:?}: stream {stream:?} ({topic}) has a gap: no usable sample at {tick_ns} ns, the last one {age_ms:.1} ms before"
-    )]
+    #[error("{log:?}: stream {stream:?} ({topic}) has a gap: no usable sample at {tick_ns} ns, the last one {age_ms:.1} ms before")]
     Gap {
         /// The log.
         log: String,

@@ -19,9 +19,7 @@ pub(crate) fn describe(binding: &Binding, gaps: &[GapEvent], start_ns: i64) -> V
 fn line(binding: &Binding, gap: &GapEvent, start_ns: i64) -> String {
     let seconds = |ns: i64| ns.saturating_sub(start_ns) as f64 / 1e9;
     let who = match gap.stream {
-        Some(stream) => {
-            format!("stream {:?} ({})", binding.streams[stream].name, binding.streams[stream].topic)
-        }
+        Some(stream) => format!("stream {:?} ({})", binding.streams[stream].name, binding.streams[stream].topic),
         None => "all streams".to_owned(),
     };
     let rule = match gap.rule {

@@ -15,6 +15,7 @@ mod recording;
 mod report;
 mod session;
 mod sink;
+mod source;
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -27,6 +28,7 @@ pub use error::{Refusal, RunError};
 pub(crate) use picture::Picture;
 pub(crate) use plan::{Plans, schema_of};
 pub(crate) use recording::OpenRecording;
+pub(crate) use source::Source;
 pub use report::{FileReport, FileStatus, LostReport, Report, StreamReport, TopicReport};
 
 use crate::contract::{CheckedContract, to_toml};
@@ -94,15 +96,7 @@ pub fn run(options: &RunOptions<'_>, report: &mut Report) -> Result<RunOutcome, 
         report.files.push(FileReport::refused(error.path(), with_hint(&error.to_string(), error.hint())));
     }
     report.warnings.extend(options.contract.warnings.iter().cloned());
-    let mut run = Run {
-        options,
-        library,
-        labels,
-        pool,
-        writer: None,
-        ages: Vec::new(),
-        is_new_folder: is_empty(options.out),
-    };
+    let mut run = Run { options, library, labels, pool, writer: None, ages: Vec::new(), is_new_folder: is_empty(options.out) };
     for (index, recording) in recordings.iter().enumerate() {
         if let Some((shard, n)) = options.shard
             && index as u64 % n != shard
@@ -154,7 +148,7 @@ impl Run<'_> {
             return Err(RunError::Interrupted);
         }
         let path = recording::path_of(recording);
-        let open = match OpenRecording::open(recording, self.options.contract) {
+        let mut open = match OpenRecording::open(recording, self.options.contract) {
             Ok(open) => open,
             Err(error) => return Ok(FileReport::refused(&path, with_hint(&error.to_string(), error.hint()))),
         };
@@ -165,6 +159,7 @@ impl Run<'_> {
                 return Ok(FileReport::refused(&path, with_hint(&refusal.to_string(), refusal.hint())));
             }
         };
+        open.select(&self.topics_of(&binding));
         let probed = probe::probe(&open, &binding, self.options.contract, &self.library)?;
         let schema = binding.schema(self.options.contract, probed.rate_hz, &probed.sizes)?;
         if let Some(stream) = probed.without_size.first() {
@@ -179,8 +174,7 @@ impl Run<'_> {
         self.prepare_writer(&schema, report)?;
         let Some(writer) = self.writer.as_mut() else { return Ok(FileReport::refused(&path, String::new())) };
         if let Some((place, expected, got)) = writer.schema().difference(&schema) {
-            let detail =
-                format!("{place} differs from the recordings before: expected {expected}, got {got}");
+            let detail = format!("{place} differs from the recordings before: expected {expected}, got {got}");
             let refusal = Refusal::OtherSchema { detail };
             return Ok(FileReport::refused(&path, with_hint(&refusal.to_string(), refusal.hint())));
         }
@@ -194,6 +188,17 @@ impl Run<'_> {
         };
         let outcome = recording::write(&context, &open, &path, writer)?;
         Ok(self.account(outcome, report))
+    }
+
+    /// Returns every topic that a contract asks for: of streams, labels and markers.
+    fn topics_of(&self, binding: &Binding) -> Vec<String> {
+        let streams = binding.streams.iter().map(|stream| stream.topic.clone());
+        let labels = self.labels.topics().into_iter().map(|(topic, _)| topic);
+        let marker = match &self.options.contract.episodes {
+            crate::contract::EpisodeRule::Marker { topic, .. } => Some(topic.clone()),
+            _ => None,
+        };
+        streams.chain(labels).chain(marker).collect()
     }
 
     fn account(&mut self, outcome: RecordingOutcome, report: &mut Report) -> FileReport {

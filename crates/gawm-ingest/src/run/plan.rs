@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use super::bind::{Binding, BoundStream};
+use super::bind::{BoundStream, Binding};
 use crate::contract::{Clock, StreamData};
 use crate::decode::{
-    ChannelSchema, CompileError, DecodeError, DecodePlan, Decoded, FieldPath, ImagePlan, RowSink,
-    SchemaLibrary, Segment, StampSource, StampUnit, Value,
+    ChannelSchema, CompileError, DecodeError, DecodePlan, Decoded, FieldPath, ImagePlan, RowSink, SchemaLibrary,
+    Segment, StampSource, StampUnit, Value,
 };
 use crate::log::Channel;
 
@@ -166,12 +166,7 @@ pub(crate) struct ChannelPlan {
 
 impl Plans {
     /// Collects what a binding wants; `events` and `infos` are topics of markers and labels, and of calibrations.
-    pub(crate) fn new(
-        binding: &Binding,
-        events: &[String],
-        infos: &[String],
-        library: &SchemaLibrary,
-    ) -> Plans {
+    pub(crate) fn new(binding: &Binding, events: &[String], infos: &[String], library: &SchemaLibrary) -> Plans {
         let mut topics: Vec<MappedTopic> = Vec::new();
         let mut index = BTreeMap::new();
         let mut at = |name: &str, topics: &mut Vec<MappedTopic>| -> usize {

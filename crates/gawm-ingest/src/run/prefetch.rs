@@ -170,16 +170,10 @@ mod tests {
     fn breaking_off_stops_the_workers() {
         let costs = vec![1; 1000];
         let mut seen = 0;
-        let flow = in_order(
-            &costs,
-            3,
-            10,
-            |index| index,
-            |_, index| {
-                seen += 1;
-                if index == 5 { ControlFlow::Break("enough") } else { ControlFlow::Continue(()) }
-            },
-        );
+        let flow = in_order(&costs, 3, 10, |index| index, |_, index| {
+            seen += 1;
+            if index == 5 { ControlFlow::Break("enough") } else { ControlFlow::Continue(()) }
+        });
         assert_eq!(flow, ControlFlow::Break("enough"));
         assert_eq!(seen, 6);
     }

@@ -44,13 +44,8 @@ pub(crate) fn probe(
     let images: Vec<usize> = (0..binding.streams.len())
         .filter(|&stream| matches!(binding.streams[stream].rule.data, StreamData::Image(_)))
         .collect();
-    let mut probed = Probed {
-        rate_hz: rate_hz.unwrap_or(0.0),
-        sizes: BTreeMap::new(),
-        without_size: Vec::new(),
-        read: 0,
-        first_loss: None,
-    };
+    let mut probed =
+        Probed { rate_hz: rate_hz.unwrap_or(0.0), sizes: BTreeMap::new(), without_size: Vec::new(), read: 0, first_loss: None };
     let plans = Plans::new(binding, &[], &[], library);
     let mut times: Vec<i64> = Vec::new();
     // Broken off or not, what was found is found.
@@ -59,9 +54,7 @@ pub(crate) fn probe(
             let topic = &plans.topics[message.topic];
             probed.read += u64::from(!topic.images.is_empty());
             if let (Some(loss), false) = (&message.loss, topic.images.is_empty()) {
-                probed
-                    .first_loss
-                    .get_or_insert_with(|| format!("the first lost as {}: {}", loss.reason, loss.detail));
+                probed.first_loss.get_or_insert_with(|| format!("the first lost as {}: {}", loss.reason, loss.detail));
             }
             if let Some((picture, _)) = &message.picture {
                 for &stream in &topic.images {
@@ -96,8 +89,7 @@ pub(crate) fn probe(
 /// Returns the rate of reference ticks; over 1 % from an integer the contract must name one.
 fn reference_rate(contract: &CheckedContract, times: &mut [i64]) -> Result<f64, RunError> {
     times.sort_unstable();
-    let mut steps: Vec<i64> =
-        times.windows(2).map(|pair| pair[1] - pair[0]).filter(|step| *step > 0).collect();
+    let mut steps: Vec<i64> = times.windows(2).map(|pair| pair[1] - pair[0]).filter(|step| *step > 0).collect();
     steps.sort_unstable();
     let measured = steps.get(steps.len() / 2).map(|&step| 1e9 / step as f64);
     if let Some(fps) = contract.written.ticks.fps {

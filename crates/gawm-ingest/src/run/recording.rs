@@ -15,12 +15,13 @@ use super::prefetch::in_order;
 use super::report::{AgeCounts, FileReport, FileStatus};
 use super::session::{Session, SessionRules};
 use super::sink::{EpisodeSink, SinkRules};
-use super::{Refusal, RunError, RunOptions, gaps, open_options, with_hint};
+use super::source::{OpenError, Source};
+use super::{Refusal, RunError, RunOptions, gaps, with_hint};
 use crate::align::Stop;
-use crate::contract::{EpisodeRule, GapRule, StreamData};
+use crate::contract::{CheckedContract, EpisodeRule, GapRule, StreamData};
 use crate::decode::SchemaLibrary;
 use crate::episodes::{Labels, RecordingLabels};
-use crate::log::{BlockRef, Channel, Damage, Log, OpenLogError, Recording, Severity};
+use crate::log::{BlockRef, Channel, Damage, Recording, Severity};
 
 /// Decoded blocks that may wait at a time, in bytes.
 const PREFETCH_BYTES: u64 = 96 << 20;
@@ -45,7 +46,7 @@ pub(crate) struct RecordingOutcome {
 /// A recording whose files are open.
 pub(crate) struct OpenRecording {
     pub(crate) name: String,
-    pub(crate) logs: Vec<Log>,
+    pub(crate) logs: Vec<Source>,
     /// Channels of all parts.
     pub(crate) channels: Vec<Arc<Channel>>,
     /// Blocks of all parts in reading order.
@@ -57,26 +58,41 @@ impl OpenRecording {
     pub(crate) fn open(
         recording: &Recording,
         contract: &crate::contract::CheckedContract,
-    ) -> Result<OpenRecording, OpenLogError> {
-        let options = open_options(contract);
-        let logs: Vec<Log> =
-            recording.parts.iter().map(|path| Log::open(path, &options)).collect::<Result<_, _>>()?;
+    ) -> Result<OpenRecording, OpenError> {
+        let logs: Vec<Source> =
+            recording.parts.iter().map(|path| Source::open(path, contract)).collect::<Result<_, _>>()?;
         Ok(OpenRecording::of(recording.name.clone(), logs))
     }
 
     /// Joins open parts.
-    pub(crate) fn of(name: String, logs: Vec<Log>) -> OpenRecording {
+    pub(crate) fn of(name: String, logs: Vec<Source>) -> OpenRecording {
         let mut channels: Vec<Arc<Channel>> = Vec::new();
-        let mut blocks = Vec::new();
-        for (part, log) in logs.iter().enumerate() {
-            for channel in log.channels().values() {
-                if !channels.iter().any(|known| **known == **channel) {
-                    channels.push(Arc::clone(channel));
+        for log in &logs {
+            for channel in log.channels() {
+                if !channels.iter().any(|known| **known == *channel) {
+                    channels.push(channel);
                 }
             }
-            blocks.extend(log.blocks().iter().map(|block| (part, block.clone())));
         }
-        OpenRecording { name, logs, channels, blocks }
+        let mut open = OpenRecording { name, logs, channels, blocks: Vec::new() };
+        open.list_blocks();
+        open
+    }
+
+    fn list_blocks(&mut self) {
+        let parts = self.logs.iter().enumerate();
+        self.blocks = parts.flat_map(|(part, log)| log.blocks().iter().map(move |b| (part, b.clone()))).collect();
+    }
+
+    /// Reads only these topics from now on, where what is not asked for need not be read.
+    pub(crate) fn select(&mut self, topics: &[String]) {
+        self.logs.iter_mut().for_each(|log| log.select(topics));
+        self.list_blocks();
+    }
+
+    /// Returns whether the parts list their episodes themselves.
+    fn has_episodes(&self) -> bool {
+        self.logs.iter().any(Source::has_episodes)
     }
 
     /// Calls `consume` with all decoded blocks in order.
@@ -89,7 +105,7 @@ impl OpenRecording {
         let costs: Vec<u64> = self.blocks.iter().map(|(_, block)| block.uncompressed_bytes.max(1)).collect();
         let work = |index: usize| {
             let (part, block) = &self.blocks[index];
-            decode_block(&self.logs[*part], block, plans)
+            decode_block(self.logs[*part].read_block(block), plans)
         };
         in_order(&costs, jobs, PREFETCH_BYTES, work, &mut consume)
     }
@@ -103,9 +119,7 @@ impl OpenRecording {
             if part == part_before {
                 before.clock_segment != block.clock_segment
             } else {
-                start(block)
-                    .zip(newest_ns)
-                    .is_some_and(|(start, newest)| start.saturating_add(window_ns) < newest)
+                start(block).zip(newest_ns).is_some_and(|(start, newest)| start.saturating_add(window_ns) < newest)
             }
         });
         // Within a segment blocks are sorted by start, so the next one with messages tells.
@@ -150,9 +164,7 @@ pub(crate) fn write(
         other => other,
     });
     match &result {
-        Ok(outcome) if outcome.file.status != FileStatus::Refused => {
-            writer.end_recording().map_err(to_dir)?
-        }
+        Ok(outcome) if outcome.file.status != FileStatus::Refused => writer.end_recording().map_err(to_dir)?,
         Ok(_) => writer.abort_recording().map_err(to_dir)?,
         Err(_) => {}
     }
@@ -163,8 +175,9 @@ fn recording_info(open: &OpenRecording) -> Result<RecordingInfo, RunError> {
     let mut files = Vec::new();
     let mut whole = blake3::Hasher::new();
     for log in &open.logs {
-        let hash =
-            log.content_hash().map_err(|source| RunError::Read { path: log.path().to_owned(), source })?;
+        let hash = log
+            .content_hash()
+            .map_err(|source| RunError::Read { path: log.path().to_owned(), source })?;
         whole.update(&hash);
         files.push(SourceFile {
             name: log.path().file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
@@ -177,7 +190,7 @@ fn recording_info(open: &OpenRecording) -> Result<RecordingInfo, RunError> {
         _ => ContentHash(*whole.finalize().as_bytes()),
     };
     let notes = open.logs.first().map(|log| {
-        [("library", log.library()), ("profile", log.profile())]
+        log.notes()
             .into_iter()
             .filter(|(_, value)| !value.is_empty())
             .map(|(key, value)| (key.to_owned(), value.to_owned()))
@@ -192,7 +205,8 @@ fn write_episodes(
     path: &Path,
     writer: &mut DatasetWriter,
 ) -> Result<RecordingOutcome, RunError> {
-    let contract = context.options.contract;
+    let own_episodes = open.has_episodes().then(|| episodes_of_records(context.options.contract));
+    let contract = own_episodes.as_ref().unwrap_or(context.options.contract);
     let label_fields = context.labels.topics();
     let mut events: Vec<String> = label_fields.iter().map(|(topic, _)| topic.clone()).collect();
     if let EpisodeRule::Marker { topic, .. } = &contract.episodes {
@@ -219,7 +233,7 @@ fn write_episodes(
         pool: context.pool,
         feature_streams: feature_streams(context.binding),
     };
-    let metadata = open.logs.iter().flat_map(Log::metadata);
+    let metadata = open.logs.iter().flat_map(Source::metadata);
     let recording = RecordingLabels::new(
         path.to_owned(),
         metadata.map(|record| (record.name.clone(), record.values.clone())).collect(),
@@ -237,6 +251,20 @@ fn write_episodes(
     let mut session = Session::new(&rules, sink);
     pass(context, open, &log, &mut session)?;
     Ok(outcome(context, open, path, session))
+}
+
+/// A table lists its episodes; `from = "file"` means those and not the whole file as one.
+fn episodes_of_records(contract: &CheckedContract) -> CheckedContract {
+    let mut contract = contract.clone();
+    if contract.episodes == EpisodeRule::File {
+        contract.episodes = EpisodeRule::Metadata {
+            record: "episode".to_owned(),
+            start_key: "start_ns".to_owned(),
+            end_key: "end_ns".to_owned(),
+            scale_ns: 1.0,
+        };
+    }
+    contract
 }
 
 fn image_rules(binding: &Binding) -> Vec<crate::contract::ImageSpec> {
@@ -314,11 +342,9 @@ fn outcome(
     if has_lost_bytes {
         count_damaged(open, &mut counts);
     }
-    warnings.extend(
-        damage
-            .iter()
-            .map(|found| format!("{} at offset {}: {}", found.kind.as_str(), found.offset, found.detail)),
-    );
+    warnings.extend(damage.iter().map(|found| {
+        format!("{} at offset {}: {}", found.kind.as_str(), found.offset, found.detail)
+    }));
     warnings.extend(gaps::describe(context.binding, &result.gaps, first_ns(open)));
     if result.short_episodes > 0 {
         warnings.push(format!(
@@ -327,10 +353,7 @@ fn outcome(
         ));
     }
     if !result.dropped_intervals.is_empty() {
-        warnings.push(format!(
-            "{} episodes were left out by gap = \"drop-episode\"",
-            result.dropped_intervals.len()
-        ));
+        warnings.push(format!("{} episodes were left out by gap = \"drop-episode\"", result.dropped_intervals.len()));
     }
     let mut error = None;
     if let Some(&stream) = empty.first() {
@@ -372,9 +395,7 @@ fn no_episode(result: &super::sink::SinkOutcome, warnings: &[String]) -> String 
         );
     }
     match warnings.last() {
-        Some(last) => format!(
-            "at no tick all required streams had a usable sample within an episode; last finding: {last}"
-        ),
+        Some(last) => format!("at no tick all required streams had a usable sample within an episode; last finding: {last}"),
         None => "at no tick all required streams had a usable sample within an episode".to_owned(),
     }
 }
@@ -386,20 +407,20 @@ fn first_ns(open: &OpenRecording) -> i64 {
 
 /// Counts the messages that the summary promises and that damage has taken.
 fn count_damaged(open: &OpenRecording, counts: &mut super::report::Counts) {
-    let mut promised: std::collections::BTreeMap<&str, u64> = std::collections::BTreeMap::new();
+    let mut promised: std::collections::BTreeMap<String, u64> = std::collections::BTreeMap::new();
     for log in &open.logs {
         let Some(summary) = log.summary_counts() else { return };
-        for (id, count) in &summary.messages_by_channel {
-            if let Some(channel) = log.channels().get(id) {
-                *promised.entry(&channel.topic).or_default() += count;
+        for channel in log.channels() {
+            if let Some(count) = summary.messages_by_channel.get(&channel.id) {
+                *promised.entry(channel.topic.clone()).or_default() += count;
             }
         }
     }
     for (topic, count) in promised {
-        let missing = count.saturating_sub(counts.read_of(topic));
+        let missing = count.saturating_sub(counts.read_of(&topic));
         if missing > 0 {
-            counts.read(topic, missing);
-            counts.lost(topic, "damaged", missing, || "in the damaged parts of the file".to_owned());
+            counts.read(&topic, missing);
+            counts.lost(&topic, "damaged", missing, || "in the damaged parts of the file".to_owned());
         }
     }
 }

@@ -156,17 +156,13 @@ impl Counts {
     /// Returns what became of the lost messages of a topic, in words.
     pub(crate) fn losses_of(&self, topic: &str) -> Vec<String> {
         let lost = self.topics.get(topic).map(|count| &count.lost);
-        lost.into_iter()
-            .flatten()
-            .map(|(reason, (n, first))| format!("{n} lost as {reason} (first: {first})"))
-            .collect()
+        lost.into_iter().flatten().map(|(reason, (n, first))| format!("{n} lost as {reason} (first: {first})")).collect()
     }
 
     /// Returns whether messages of mapped topics were lost.
     pub(crate) fn has_loss(&self) -> bool {
         self.topics.values().any(|count| {
-            count.is_mapped
-                && count.lost.iter().any(|(reason, (n, _))| *n > 0 && !HARMLESS.contains(&reason.as_str()))
+            count.is_mapped && count.lost.iter().any(|(reason, (n, _))| *n > 0 && !HARMLESS.contains(&reason.as_str()))
         })
     }
 

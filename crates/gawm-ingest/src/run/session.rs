@@ -169,28 +169,19 @@ impl<'a, 's> Session<'a, 's> {
     pub(crate) fn finish(&mut self) -> Result<(), Stop> {
         self.close_segment()?;
         if self.reordered > 0 {
-            let text = format!(
-                "{} messages of mapped topics were out of order and have been sorted",
-                self.reordered
-            );
+            let text = format!("{} messages of mapped topics were out of order and have been sorted", self.reordered);
             self.warn(text);
         }
         for (topic, count) in std::mem::take(&mut self.not_in_message) {
-            self.warn(format!(
-                "{topic}: {count} messages hold none of the mapped elements, and were passed over"
-            ));
+            self.warn(format!("{topic}: {count} messages hold none of the mapped elements, and were passed over"));
         }
         if self.unclosed > 0 {
-            let text = format!(
-                "{} episodes have no end mark; closed at the next start or at the end of the log",
-                self.unclosed
-            );
+            let text = format!("{} episodes have no end mark; closed at the next start or at the end of the log", self.unclosed);
             self.warn(text);
         }
         for (stream, count) in std::mem::take(&mut self.non_finite) {
             let name = &self.rules.binding.streams[stream].name;
-            let text =
-                format!("stream {name:?}: {count} samples hold NaN or infinity; their rows are not valid");
+            let text = format!("stream {name:?}: {count} samples hold NaN or infinity; their rows are not valid");
             self.warn(text);
         }
         Ok(())
@@ -239,10 +230,7 @@ impl<'a, 's> Session<'a, 's> {
             match mark {
                 Mark::Start => {
                     if self.is_marked {
-                        let has_stop = matches!(
-                            &self.rules.contract.episodes,
-                            EpisodeRule::Marker { stop: Some(_), .. }
-                        );
+                        let has_stop = matches!(&self.rules.contract.episodes, EpisodeRule::Marker { stop: Some(_), .. });
                         self.unclosed += u64::from(has_stop);
                         self.aligner.close_interval(time_ns - 1);
                         self.set_end(last, time_ns - 1);
@@ -286,9 +274,7 @@ impl<'a, 's> Session<'a, 's> {
         }
         recent.newest_ns = Some(newest);
         if let Some(loss) = &message.loss {
-            return self
-                .counts
-                .lost(&name, loss.reason, 1, || format!("offset {}: {}", message.offset, loss.detail));
+            return self.counts.lost(&name, loss.reason, 1, || format!("offset {}: {}", message.offset, loss.detail));
         }
         self.take_rows(&message, values, &name);
         self.take_picture(&message, &name);
@@ -317,9 +303,7 @@ impl<'a, 's> Session<'a, 's> {
             }
             let row = &values[range.clone()];
             for (stream, columns) in &group.streams {
-                let StreamData::Vector(vector) = &self.rules.binding.streams[*stream].rule.data else {
-                    continue;
-                };
+                let StreamData::Vector(vector) = &self.rules.binding.streams[*stream].rule.data else { continue };
                 let mut converted: Vec<f64> = row[columns.clone()].to_vec();
                 if !vector.unit.is_identity() {
                     converted.iter_mut().for_each(|value| *value = vector.unit.apply(*value));
@@ -357,10 +341,7 @@ impl<'a, 's> Session<'a, 's> {
             let expected = *self.sizes.entry(stream).or_insert(size);
             if size != expected {
                 self.counts.lost(name, "image_size_changed", 1, || {
-                    format!(
-                        "offset {}: expected {}x{}, got {}x{}",
-                        message.offset, expected.0, expected.1, size.0, size.1
-                    )
+                    format!("offset {}: expected {}x{}, got {}x{}", message.offset, expected.0, expected.1, size.0, size.1)
                 });
                 return;
             }

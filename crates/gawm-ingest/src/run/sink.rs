@@ -115,8 +115,7 @@ impl<'a> EpisodeSink<'a> {
     }
 
     fn flush(&mut self, is_end: bool) -> Result<(), RunError> {
-        let Some(open) = self.open.as_mut().filter(|open| !open.is_skipped && !open.rows.time_ns.is_empty())
-        else {
+        let Some(open) = self.open.as_mut().filter(|open| !open.is_skipped && !open.rows.time_ns.is_empty()) else {
             return Ok(());
         };
         if open.info.is_none() {
@@ -156,8 +155,7 @@ impl<'a> EpisodeSink<'a> {
             end_ns,
             record: interval.and_then(|interval| interval.record.as_ref()),
         };
-        let EpisodeLabels { task, success, operator, robot, session } =
-            self.rules.labels.of(&self.recording, asked);
+        let EpisodeLabels { task, success, operator, robot, session } = self.rules.labels.of(&self.recording, asked);
         let mut tags = BTreeMap::new();
         if open.start.part > 0 {
             tags.insert("part".to_owned(), open.start.part.to_string());
@@ -305,23 +303,15 @@ impl PendingRows {
     }
 
     /// Writes the rows; returns how many pictures could not be encoded.
-    fn write(
-        &mut self,
-        log: &str,
-        rules: &SinkRules<'_>,
-        writer: &mut DatasetWriter,
-    ) -> Result<u64, RunError> {
+    fn write(&mut self, log: &str, rules: &SinkRules<'_>, writer: &mut DatasetWriter) -> Result<u64, RunError> {
         let mut failed = 0;
         let mut images = Vec::new();
-        for (index, (pictures, mut valid)) in std::mem::take(&mut self.pictures)
-            .into_iter()
-            .zip(std::mem::take(&mut self.picture_valid))
-            .enumerate()
+        for (index, (pictures, mut valid)) in
+            std::mem::take(&mut self.pictures).into_iter().zip(std::mem::take(&mut self.picture_valid)).enumerate()
         {
             let rule = &rules.images[index];
             let encode = |picture: &Picture| picture.encoded(rule).ok();
-            let encoded: Vec<Option<Bytes>> =
-                rules.pool.install(|| pictures.par_iter().map(encode).collect());
+            let encoded: Vec<Option<Bytes>> = rules.pool.install(|| pictures.par_iter().map(encode).collect());
             let fallback = encoded.iter().flatten().next().cloned().unwrap_or_default();
             let mut frames: Vec<Bytes> = Vec::with_capacity(encoded.len());
             for (row, frame) in encoded.into_iter().enumerate() {
@@ -340,11 +330,8 @@ impl PendingRows {
             images,
             ages: std::mem::take(&mut self.ages),
         };
-        let trajectory = Trajectory::try_new(rules.schema, rows).map_err(|source| RunError::Rows {
-            log: log.to_owned(),
-            time_ns,
-            source,
-        })?;
+        let trajectory = Trajectory::try_new(rules.schema, rows)
+            .map_err(|source| RunError::Rows { log: log.to_owned(), time_ns, source })?;
         writer
             .write(trajectory)
             .map_err(|source| RunError::Write { dir: std::path::PathBuf::new(), source })?;

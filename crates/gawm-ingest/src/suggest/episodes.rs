@@ -2,9 +2,9 @@
 
 use serde_json::Value;
 
-use super::Suggestion;
 use super::names;
 use super::survey::{Survey, Topic};
+use super::Suggestion;
 use crate::contract::{
     EpisodeSource, EpisodesSpec, LabelSource, MarkerValue, MetadataLabel, TimeUnit, TopicLabel,
 };
@@ -20,13 +20,9 @@ pub(crate) fn guess(suggestion: &mut Suggestion, survey: &Survey) {
             suggestion.contract.episodes = spec;
             reasons.push(reason);
         }
-        None => {
-            reasons.push("no episode marks found: each recording is one episode, split at gaps".to_owned())
-        }
+        None => reasons.push("no episode marks found: each recording is one episode, split at gaps".to_owned()),
     }
-    if let (EpisodeSource::Marker, Some(topic)) =
-        (suggestion.contract.episodes.from, &suggestion.contract.episodes.topic)
-    {
+    if let (EpisodeSource::Marker, Some(topic)) = (suggestion.contract.episodes.from, &suggestion.contract.episodes.topic) {
         remove_topic(suggestion, &topic.clone());
     }
     suggestion.reasons.insert("episodes", reasons);
@@ -36,8 +32,7 @@ pub(crate) fn guess(suggestion: &mut Suggestion, survey: &Survey) {
 /// A topic that marks episodes is no column.
 fn remove_topic(suggestion: &mut Suggestion, topic: &str) {
     let streams = &suggestion.contract.stream;
-    let kept: Vec<usize> =
-        (0..streams.len()).filter(|&at| streams[at].topic.as_deref() != Some(topic)).collect();
+    let kept: Vec<usize> = (0..streams.len()).filter(|&at| streams[at].topic.as_deref() != Some(topic)).collect();
     if !kept.is_empty() && kept.len() < streams.len() {
         suggestion.contract.stream = kept.iter().map(|&at| suggestion.contract.stream[at].clone()).collect();
         suggestion.stream_reasons = kept.iter().map(|&at| suggestion.stream_reasons[at].clone()).collect();
@@ -52,14 +47,12 @@ fn from_metadata(survey: &Survey) -> Option<(EpisodesSpec, String)> {
                 values.iter().find_map(|(key, text)| {
                     let key_words = names::words(key);
                     let ns = text.trim().parse::<f64>().ok()? * scale;
-                    let is_within =
-                        ns >= survey.span_ns.0 as f64 - 1e9 && ns <= survey.span_ns.1 as f64 + 1e9;
+                    let is_within = ns >= survey.span_ns.0 as f64 - 1e9 && ns <= survey.span_ns.1 as f64 + 1e9;
                     (is_within && words.iter().any(|word| key_words.iter().any(|other| other == word)))
                         .then(|| (key.clone(), ns))
                 })
             };
-            let (Some(start), Some(end)) = (time(["start", "begin", "from"]), time(["end", "stop", "to"]))
-            else {
+            let (Some(start), Some(end)) = (time(["start", "begin", "from"]), time(["end", "stop", "to"])) else {
                 continue;
             };
             if start.1 >= end.1 {
@@ -74,10 +67,7 @@ fn from_metadata(survey: &Survey) -> Option<(EpisodesSpec, String)> {
                 time_unit: unit,
                 ..EpisodesSpec::default()
             };
-            return Some((
-                spec,
-                format!("{n} metadata records {name:?} hold start and end times within the log"),
-            ));
+            return Some((spec, format!("{n} metadata records {name:?} hold start and end times within the log")));
         }
     }
     None
@@ -96,12 +86,8 @@ fn messages(topic: &Topic, library: &SchemaLibrary) -> Vec<Value> {
 
 /// A topic of texts that say `start` and `end`, plain or in JSON.
 fn event_marker(topic: &Topic, library: &SchemaLibrary) -> Option<(EpisodesSpec, String)> {
-    let texts: Vec<&str> = topic
-        .fields
-        .iter()
-        .filter(|f| f.scalar == Some(Scalar::Text) && f.arrays.is_empty())
-        .map(|f| f.path.as_str())
-        .collect();
+    let texts: Vec<&str> =
+        topic.fields.iter().filter(|f| f.scalar == Some(Scalar::Text) && f.arrays.is_empty()).map(|f| f.path.as_str()).collect();
     if texts.is_empty() || topic.messages > 100_000 {
         return None;
     }
@@ -113,25 +99,13 @@ fn event_marker(topic: &Topic, library: &SchemaLibrary) -> Option<(EpisodesSpec,
         }
     }
     let starts = ["start", "started", "begin", "episode_start", "start_episode", "recording_started"];
-    let stops = [
-        "end",
-        "stop",
-        "stopped",
-        "finish",
-        "finished",
-        "done",
-        "episode_end",
-        "end_episode",
-        "recording_stopped",
-    ];
+    let stops = ["end", "stop", "stopped", "finish", "finished", "done", "episode_end", "end_episode", "recording_stopped"];
     for path in paths {
         let said: Vec<String> = messages
             .iter()
             .filter_map(|message| crate::episodes::value_at(message, &path)?.as_str().map(str::to_owned))
             .collect();
-        let pick = |wanted: &[&str]| {
-            said.iter().find(|text| wanted.contains(&text.to_lowercase().as_str())).cloned()
-        };
+        let pick = |wanted: &[&str]| said.iter().find(|text| wanted.contains(&text.to_lowercase().as_str())).cloned();
         if let Some(start) = pick(&starts) {
             let stop = pick(&stops);
             let spec = EpisodesSpec {
@@ -151,8 +125,7 @@ fn event_marker(topic: &Topic, library: &SchemaLibrary) -> Option<(EpisodesSpec,
 
 /// A flag whose name says that something is recorded.
 fn flag_marker(topic: &Topic, library: &SchemaLibrary) -> Option<(EpisodesSpec, String)> {
-    let mut flags =
-        topic.fields.iter().filter(|field| field.scalar == Some(Scalar::Bool) && field.arrays.is_empty());
+    let mut flags = topic.fields.iter().filter(|field| field.scalar == Some(Scalar::Bool) && field.arrays.is_empty());
     let flag = flags.next()?;
     let is_named = names::is_recording(&topic.channel.topic) || names::is_recording(&flag.path);
     let ever_true = messages(topic, library)
@@ -187,8 +160,7 @@ fn labels(suggestion: &mut Suggestion, survey: &Survey) {
         let own = survey.metadata.iter().find(|(name, values)| {
             Some(name) == record.as_ref() && wanted.iter().any(|key| values.contains_key(*key))
         });
-        let any =
-            survey.metadata.iter().find(|(_, values)| wanted.iter().any(|key| values.contains_key(*key)));
+        let any = survey.metadata.iter().find(|(_, values)| wanted.iter().any(|key| values.contains_key(*key)));
         let source = own.or(any).and_then(|(name, values)| {
             let key = wanted.iter().find(|key| values.contains_key(**key))?;
             Some(LabelSource::Metadata(MetadataLabel { metadata: name.clone(), key: (*key).to_owned() }))
@@ -208,10 +180,7 @@ fn labels(suggestion: &mut Suggestion, survey: &Survey) {
     }
     if suggestion.contract.labels.task.is_none() {
         suggestion.contract.labels.task = Some(LabelSource::Constant("no task given".to_owned()));
-        reasons.push(
-            "task: nothing in the log says it; write what the robot does, policies are told this text"
-                .to_owned(),
-        );
+        reasons.push("task: nothing in the log says it; write what the robot does, policies are told this text".to_owned());
     }
     suggestion.reasons.insert("labels", reasons);
 }
@@ -229,15 +198,9 @@ fn topic_label(label: &str, suggestion: &Suggestion, survey: &Survey) -> Option<
     if label == "task" {
         let topic = survey.topics.values().find(|topic| {
             names::is_task(&topic.channel.topic)
-                && topic
-                    .fields
-                    .iter()
-                    .any(|f| f.scalar == Some(Scalar::Text) && f.arrays.is_empty() && f.path == "data")
+                && topic.fields.iter().any(|f| f.scalar == Some(Scalar::Text) && f.arrays.is_empty() && f.path == "data")
         })?;
-        return Some(LabelSource::Topic(TopicLabel {
-            topic: topic.channel.topic.clone(),
-            field: "data".to_owned(),
-        }));
+        return Some(LabelSource::Topic(TopicLabel { topic: topic.channel.topic.clone(), field: "data".to_owned() }));
     }
     if label == "success" {
         let marker = suggestion.contract.episodes.topic.as_ref()?;
@@ -245,8 +208,7 @@ fn topic_label(label: &str, suggestion: &Suggestion, survey: &Survey) -> Option<
         let field = suggestion.contract.episodes.field.as_ref()?;
         let parent = field.rsplit_once('.').map_or("", |(parent, _)| parent);
         let path = if parent.is_empty() { "success".to_owned() } else { format!("{parent}.success") };
-        let is_there =
-            messages(topic, &library).iter().any(|m| crate::episodes::value_at(m, &path).is_some());
+        let is_there = messages(topic, &library).iter().any(|m| crate::episodes::value_at(m, &path).is_some());
         return is_there.then(|| LabelSource::Topic(TopicLabel { topic: marker.clone(), field: path }));
     }
     None

@@ -53,10 +53,7 @@ pub(crate) fn guess(survey: &Survey, library: &SchemaLibrary) -> Suggestion {
     if found.iter().any(|(topic, guess)| is_rich(topic) && !matches!(guess, Guess::Skip(_))) {
         for (topic, guess) in &mut found {
             if !is_rich(topic) && !matches!(guess, Guess::Skip(_)) {
-                let text = format!(
-                    "{} messages in {} of {} logs",
-                    topic.messages, topic.recordings, survey.recordings
-                );
+                let text = format!("{} messages in {} of {} logs", topic.messages, topic.recordings, survey.recordings);
                 *guess = Guess::Skip(text);
             }
         }
@@ -106,11 +103,7 @@ fn guess_topic(topic: &Topic, survey: &Survey, library: &SchemaLibrary) -> Guess
         return Guess::Skip("no message could be decoded".to_owned());
     }
     let groups = joints(topic, &messages, survey).unwrap_or_else(|| numbers(topic, &messages));
-    if groups.is_empty() {
-        Guess::Skip("holds no numbers of fixed number".to_owned())
-    } else {
-        Guess::Vectors(groups)
-    }
+    if groups.is_empty() { Guess::Skip("holds no numbers of fixed number".to_owned()) } else { Guess::Vectors(groups) }
 }
 
 /// Returns whether a topic holds images; an error when it does, of a kind that cannot be used.
@@ -144,10 +137,9 @@ fn is_camera(topic: &Topic, library: &SchemaLibrary) -> Option<Result<(), String
 /// Joint positions by name, when the message has parallel `name` and `position` arrays.
 fn joints(topic: &Topic, messages: &[Value], survey: &Survey) -> Option<Vec<Group>> {
     let has = |path: &str| topic.fields.iter().any(|field| field.path == path);
-    let (key, value) =
-        [("name", "position"), ("joint_names", "positions"), ("names", "positions"), ("name", "positions")]
-            .into_iter()
-            .find(|(key, value)| has(&format!("{key}[]")) && has(&format!("{value}[]")))?;
+    let (key, value) = [("name", "position"), ("joint_names", "positions"), ("names", "positions"), ("name", "positions")]
+        .into_iter()
+        .find(|(key, value)| has(&format!("{key}[]")) && has(&format!("{value}[]")))?;
     let names_of = |message: &Value| -> Option<Vec<String>> {
         let names = message.get(key)?.as_array()?;
         let values = message.get(value)?.as_array()?;
@@ -176,17 +168,11 @@ fn joints(topic: &Topic, messages: &[Value], survey: &Survey) -> Option<Vec<Grou
     for name in common {
         let joint = known.get(&name);
         let (kind, unit, reason) = match joint.map(|joint| joint.kind.as_str()) {
-            Some("prismatic") if names::is_gripper(&name) => {
-                (KindSpec::Gripper, "m", "prismatic in the URDF, and named as a gripper")
-            }
+            Some("prismatic") if names::is_gripper(&name) => (KindSpec::Gripper, "m", "prismatic in the URDF, and named as a gripper"),
             Some("prismatic") => (KindSpec::Linear, "m", "prismatic in the URDF"),
             Some(_) => (KindSpec::Angle, "rad", "revolute or continuous in the URDF"),
-            None if names::is_gripper(&name) => {
-                (KindSpec::Gripper, "m", "named as a gripper; no URDF says its unit")
-            }
-            None => {
-                (KindSpec::Angle, "rad", "positions of joints are angles in rad unless a URDF says otherwise")
-            }
+            None if names::is_gripper(&name) => (KindSpec::Gripper, "m", "named as a gripper; no URDF says its unit"),
+            None => (KindSpec::Angle, "rad", "positions of joints are angles in rad unless a URDF says otherwise"),
         };
         let limits = joint.and_then(|joint| joint.limits);
         let field = format!("{value}[{key}=\"{}\"]", name.replace('\\', "\\\\").replace('"', "\\\""));
@@ -245,19 +231,9 @@ fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
             break;
         }
         let (kind, unit, reason) = kind_of(topic, field);
-        match groups
-            .last_mut()
-            .filter(|group| group.kind == kind && group.unit == unit && group.reason == reason)
-        {
+        match groups.last_mut().filter(|group| group.kind == kind && group.unit == unit && group.reason == reason) {
             Some(group) => group.fields.push(path),
-            None => groups.push(Group {
-                fields: vec![path],
-                kind,
-                unit,
-                limits: Vec::new(),
-                reason,
-                is_joints: false,
-            }),
+            None => groups.push(Group { fields: vec![path], kind, unit, limits: Vec::new(), reason, is_joints: false }),
         }
     }
     // A single text that holds JSON: its numbers, when all samples have them.
@@ -293,9 +269,7 @@ fn quaternion_at(fields: &[&FieldInfo]) -> Option<(&'static str, Vec<String>)> {
 fn fixed_path(field: &FieldInfo, messages: &[Value]) -> Option<(String, usize)> {
     match field.arrays.as_slice() {
         [] => {
-            let is_there = messages
-                .iter()
-                .all(|message| is_number(crate::episodes::value_at(message, &field.path).as_ref()));
+            let is_there = messages.iter().all(|message| is_number(crate::episodes::value_at(message, &field.path).as_ref()));
             is_there.then(|| (field.path.clone(), 1))
         }
         [_] if field.path.ends_with("[]") => {
@@ -333,13 +307,7 @@ fn kind_of(topic: &Topic, field: &FieldInfo) -> (KindSpec, Option<String>, Strin
         return (KindSpec::Bool, None, "truth values".to_owned());
     }
     if names::is_gripper(&field.path) || names::is_gripper(&topic.channel.topic) {
-        let unit = if field.path.ends_with("_m") {
-            some("m")
-        } else if field.path.ends_with("_n") {
-            some("N")
-        } else {
-            None
-        };
+        let unit = if field.path.ends_with("_m") { some("m") } else if field.path.ends_with("_n") { some("N") } else { None };
         if unit.as_deref() != Some("N") {
             return (KindSpec::Gripper, unit, "named as a gripper".to_owned());
         }
@@ -348,9 +316,7 @@ fn kind_of(topic: &Topic, field: &FieldInfo) -> (KindSpec, Option<String>, Strin
     let bare = topic.type_name().rsplit(['/', '.']).next().unwrap_or("");
     let is_pose = field.owner.ends_with("Point") || has("position") || has("translation");
     let unit = match () {
-        () if has("angular") && (has("velocity") || bare.starts_with("Twist") || has("twist")) => {
-            some("rad/s")
-        }
+        () if has("angular") && (has("velocity") || bare.starts_with("Twist") || has("twist")) => some("rad/s"),
         () if has("acceleration") => some("m/s^2"),
         () if has("linear") && (has("velocity") || bare.starts_with("Twist") || has("twist")) => some("m/s"),
         () if is_pose && field.path.ends_with(['x', 'y', 'z']) => some("m"),
@@ -366,14 +332,12 @@ fn kind_of(topic: &Topic, field: &FieldInfo) -> (KindSpec, Option<String>, Strin
         () if field.path.ends_with("_m") => some("m"),
         () => None,
     };
-    let reason =
-        if unit.is_some() { "unit by type and name" } else { "unit unknown: say `unit` if you know it" };
+    let reason = if unit.is_some() { "unit by type and name" } else { "unit unknown: say `unit` if you know it" };
     (KindSpec::Linear, unit, reason.to_owned())
 }
 
 fn json_in_text(topic: &Topic, messages: &[Value]) -> Option<Group> {
-    let text_field =
-        topic.fields.iter().find(|field| field.scalar == Some(Scalar::Text) && field.arrays.is_empty())?;
+    let text_field = topic.fields.iter().find(|field| field.scalar == Some(Scalar::Text) && field.arrays.is_empty())?;
     let parse = |message: &Value| -> Option<Value> {
         let text = crate::episodes::value_at(message, &text_field.path)?;
         serde_json::from_str(text.as_str()?).ok()
@@ -384,8 +348,7 @@ fn json_in_text(topic: &Topic, messages: &[Value]) -> Option<Group> {
     let mut fields = Vec::new();
     for (name, value) in first {
         let is_plain = name.chars().all(|c| c.is_alphanumeric() || c == '_');
-        let is_always =
-            inner.iter().all(|other| other.get(name).is_some_and(|v| v.is_number() || v.is_boolean()));
+        let is_always = inner.iter().all(|other| other.get(name).is_some_and(|v| v.is_number() || v.is_boolean()));
         if is_plain && is_always && value.is_number() && !names::is_bookkeeping(name) {
             fields.push(format!("{}.{name}", text_field.path));
         }
@@ -419,9 +382,7 @@ pub(crate) fn clock_of(topic: &Topic) -> (String, String) {
                 );
                 return publish_or_log(topic, reason);
             }
-            None if report.messages == 1 => {
-                return ("stamp".to_owned(), "one message, with a header stamp".to_owned());
-            }
+            None if report.messages == 1 => return ("stamp".to_owned(), "one message, with a header stamp".to_owned()),
             None => {}
         }
     }
@@ -435,10 +396,7 @@ fn publish_or_log(topic: &Topic, otherwise: String) -> (String, String) {
                 && offset.median_ms.abs() <= MAX_STAMP_OFFSET_MS
                 && offset.p95_ms - offset.p05_ms <= MAX_STAMP_OFFSET_MS =>
         {
-            let reason = format!(
-                "publish time, {:.1} ms before the log time; no usable header stamp",
-                offset.median_ms
-            );
+            let reason = format!("publish time, {:.1} ms before the log time; no usable header stamp", offset.median_ms);
             ("publish".to_owned(), reason)
         }
         _ => ("log".to_owned(), otherwise),
@@ -484,11 +442,8 @@ fn base_stream(topic: &Topic, feature: &str, role: RoleSpec) -> (StreamSpec, Vec
         action: None,
         image: None,
     };
-    let reasons = vec![
-        format!("{}, {} messages", shown_type(topic), topic.messages),
-        format!("clock: {clock_reason}"),
-        format!("tolerance: {rate_reason}"),
-    ];
+    let reasons =
+        vec![format!("{}, {} messages", shown_type(topic), topic.messages), format!("clock: {clock_reason}"), format!("tolerance: {rate_reason}")];
     (stream, reasons)
 }
 
@@ -507,11 +462,7 @@ fn add_groups(
         stream.unit.clone_from(&group.unit);
         stream.limits.clone_from(&group.limits);
         stream.order = (group.kind == KindSpec::Quaternion).then(|| {
-            if group.fields.first().is_some_and(|field| field.ends_with(".w")) {
-                QuaternionOrder::Wxyz
-            } else {
-                QuaternionOrder::Xyzw
-            }
+            if group.fields.first().is_some_and(|field| field.ends_with(".w")) { QuaternionOrder::Wxyz } else { QuaternionOrder::Xyzw }
         });
         if role == RoleSpec::Action {
             stream.action = Some(action_rule(ActionTimingSpec::InForce));
@@ -529,9 +480,7 @@ pub(crate) fn action_rule(timing: ActionTimingSpec) -> ActionSpec {
 
 /// Returns whether a topic, or some of its fields, are commands.
 fn command_split(topic: &Topic, groups: &[Group]) -> (Vec<Group>, Vec<Group>) {
-    if names::is_command(&topic.channel.topic)
-        || names::is_command(topic.type_name().rsplit(['/', '.']).next().unwrap_or(""))
-    {
+    if names::is_command(&topic.channel.topic) || names::is_command(topic.type_name().rsplit(['/', '.']).next().unwrap_or("")) {
         return (Vec::new(), groups.to_vec());
     }
     let (mut states, mut commands) = (Vec::new(), Vec::new());
@@ -567,13 +516,9 @@ fn add_states(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Gu
     let mut has_state = false;
     for (topic, groups) in &measured {
         let (state, why) = match () {
-            () if is_marker(groups, topic) => {
-                (None, "a flag that is switched at times: an annotation of each row")
-            }
+            () if is_marker(groups, topic) => (None, "a flag that is switched at times: an annotation of each row"),
             () if is_joints(groups) => (Some(()), "joint states are the state"),
-            () if has_joints && is_gripper(topic, groups) => {
-                (Some(()), "a gripper belongs to the state of the arm")
-            }
+            () if has_joints && is_gripper(topic, groups) => (Some(()), "a gripper belongs to the state of the arm"),
             () if has_joints => (None, "beside the joint states: carried along, not a target"),
             () => (Some(()), "no joint states in this log: every number that is measured is state"),
         };
@@ -586,9 +531,7 @@ fn add_states(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Gu
             }
             _ if !covers => suggestion.unmapped.push(format!(
                 "{} ({}): {} messages that cover less than half of the log",
-                topic.channel.topic,
-                shown_type(topic),
-                topic.messages
+                topic.channel.topic, shown_type(topic), topic.messages
             )),
             _ if is_marker(groups, topic) => {
                 if !names::is_recording(&topic.channel.topic) {
@@ -596,25 +539,11 @@ fn add_states(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Gu
                     add_groups(suggestion, topic, groups, &feature, RoleSpec::Annotation, why);
                 }
             }
-            _ => add_groups(
-                suggestion,
-                topic,
-                groups,
-                &format!("observation.{feature}"),
-                RoleSpec::Observation,
-                why,
-            ),
+            _ => add_groups(suggestion, topic, groups, &format!("observation.{feature}"), RoleSpec::Observation, why),
         }
     }
     if !has_state && let Some((topic, groups)) = measured.iter().max_by_key(|(topic, _)| topic.messages) {
-        add_groups(
-            suggestion,
-            topic,
-            groups,
-            "observation.state",
-            RoleSpec::State,
-            "the topic with most messages",
-        );
+        add_groups(suggestion, topic, groups, "observation.state", RoleSpec::State, "the topic with most messages");
     }
 }
 
@@ -635,8 +564,7 @@ fn add_actions(suggestion: &mut Suggestion, found: &[(&Topic, Guess)]) {
                 if is_angular && group.fields.len() == 3 {
                     group.kind = KindSpec::Rotvec;
                     group.unit = Some("rad".to_owned());
-                    "a step of rotation, by the topic's name: a rotation vector"
-                        .clone_into(&mut group.reason);
+                    "a step of rotation, by the topic's name: a rotation vector".clone_into(&mut group.reason);
                 } else if group.unit.as_deref() == Some("m/s") {
                     group.unit = Some("m".to_owned());
                     "a step of position, by the topic's name".clone_into(&mut group.reason);
@@ -658,8 +586,7 @@ fn add_camera(suggestion: &mut Suggestion, topic: &Topic, survey: &Survey) {
     if taken(&name, &suggestion.contract.stream) {
         name = words.join("_");
     }
-    let (mut stream, mut reasons) =
-        base_stream(topic, &format!("observation.images.{name}"), RoleSpec::Image);
+    let (mut stream, mut reasons) = base_stream(topic, &format!("observation.images.{name}"), RoleSpec::Image);
     let info = camera_info(topic, survey);
     if let Some(info) = &info {
         reasons.push(format!("calibration: {info}, the one nearest by its name"));
@@ -679,11 +606,7 @@ fn camera_info(topic: &Topic, survey: &Survey) -> Option<String> {
         let bare = other.type_name().rsplit(['/', '.']).next().unwrap_or("");
         matches!(bare, "CameraInfo" | "CameraCalibration")
     });
-    infos
-        .map(|info| (shared(&info.channel.topic), info.channel.topic.clone()))
-        .filter(|(n, _)| *n > 0)
-        .max()
-        .map(|(_, name)| name)
+    infos.map(|info| (shared(&info.channel.topic), info.channel.topic.clone())).filter(|(n, _)| *n > 0).max().map(|(_, name)| name)
 }
 
 /// A log without commands gets actions made from the state.
@@ -723,8 +646,7 @@ fn add_derived(suggestion: &mut Suggestion) {
         image: None,
     });
     suggestion.stream_reasons.push(vec![
-        "no command topic in the log: the action of a row is the state of the next one, marked as derived"
-            .to_owned(),
+        "no command topic in the log: the action of a row is the state of the next one, marked as derived".to_owned(),
     ]);
 }
 
@@ -734,8 +656,7 @@ fn set_rate(suggestion: &mut Suggestion, survey: &Survey) {
         (topic.rate_hz() > 0.0 && stream.tolerance_ms.is_some()).then(|| topic.rate_hz())
     };
     let slowest = |role: RoleSpec| {
-        let rates =
-            suggestion.contract.stream.iter().filter(|stream| stream.role == Some(role)).filter_map(rate_of);
+        let rates = suggestion.contract.stream.iter().filter(|stream| stream.role == Some(role)).filter_map(rate_of);
         rates.reduce(f64::min)
     };
     let fastest = suggestion.contract.stream.iter().filter_map(rate_of).reduce(f64::max);
@@ -749,10 +670,7 @@ fn set_rate(suggestion: &mut Suggestion, survey: &Survey) {
         rate = MAX_RATE_HZ;
     }
     let span_s = (survey.span_ns.1.saturating_sub(survey.span_ns.0)) as f64 / 1e9;
-    if span_s > 0.0
-        && span_s * rate < MIN_ROWS
-        && let Some(fastest) = fastest.filter(|fastest| *fastest > rate)
-    {
+    if span_s > 0.0 && span_s * rate < MIN_ROWS && let Some(fastest) = fastest.filter(|fastest| *fastest > rate) {
         let state = slowest(RoleSpec::State).unwrap_or(fastest);
         if state > rate {
             reason = format!("the log is {span_s:.2} s short, so the rate of the state: {state:.3} Hz");
@@ -761,10 +679,8 @@ fn set_rate(suggestion: &mut Suggestion, survey: &Survey) {
     }
     // Integers are what LeRobot stores: the nearest where it is within 5 %, else the next below.
     let rounded = if (rate.round() / rate - 1.0).abs() <= 0.05 { rate.round() } else { rate.floor() };
-    let (rate_hz, fps) =
-        if rounded >= 1.0 { (rounded, None) } else { ((rate * 1e4).round().max(100.0) / 1e4, Some(1)) };
-    suggestion.contract.ticks =
-        TicksSpec { mode: TickMode::Fixed, rate_hz: Some(rate_hz), fps, stream: None };
+    let (rate_hz, fps) = if rounded >= 1.0 { (rounded, None) } else { ((rate * 1e4).round().max(100.0) / 1e4, Some(1)) };
+    suggestion.contract.ticks = TicksSpec { mode: TickMode::Fixed, rate_hz: Some(rate_hz), fps, stream: None };
     suggestion.reasons.insert("ticks", vec![reason]);
 }
 

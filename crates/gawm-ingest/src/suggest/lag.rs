@@ -61,8 +61,7 @@ fn on_grid(series: &Series, start_ns: i64, n: usize) -> Vec<f64> {
             }
             let (a, b) = (at, (at + 1).min(series.values.len() - 1));
             let width = (series.times_ns[b] - series.times_ns[a]) as f64;
-            let share =
-                if width > 0.0 { ((ns - series.times_ns[a]) as f64 / width).clamp(0.0, 1.0) } else { 0.0 };
+            let share = if width > 0.0 { ((ns - series.times_ns[a]) as f64 / width).clamp(0.0, 1.0) } else { 0.0 };
             series.values[a] + (series.values[b] - series.values[a]) * share
         })
         .collect()
@@ -146,8 +145,7 @@ mod tests {
     fn finds_the_delay_of_positions_and_velocities() {
         let state = series(10.0, 1000, |t| motion(t - 0.04));
         check_following(&series(20.0, 500, motion), &state, 0.04, false);
-        let speed =
-            |t: f64| 2.0 * (2.0 * t).cos() + 0.4 * 5.3 * (5.3 * t + 1.0).cos() - 1.1 * (11.0 * t).sin();
+        let speed = |t: f64| 2.0 * (2.0 * t).cos() + 0.4 * 5.3 * (5.3 * t + 1.0).cos() - 1.1 * (11.0 * t).sin();
         check_following(&series(4.0, 2500, speed), &state, 0.04, true);
     }
 

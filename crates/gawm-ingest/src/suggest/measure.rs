@@ -69,8 +69,7 @@ fn read(suggestion: &Suggestion, survey: &Survey, library: &SchemaLibrary) -> Op
                 }
                 for (stream, columns) in &group.streams {
                     let bound = &binding.streams[*stream];
-                    let series =
-                        all.entry(bound.rule.index).or_insert_with(|| vec![Series::default(); columns.len()]);
+                    let series = all.entry(bound.rule.index).or_insert_with(|| vec![Series::default(); columns.len()]);
                     let ns = match bound.rule.clock {
                         Clock::Log => message.log_ns,
                         Clock::Publish => message.publish_ns,
@@ -133,8 +132,7 @@ fn split_by_wrap(suggestion: &mut Suggestion, series: &StreamSeries) {
 fn wrap_of(values: &[f64]) -> Wrap {
     use std::f64::consts::PI;
     let has_jump = values.windows(2).any(|pair| ((pair[1] - pair[0]).abs() - 2.0 * PI).abs() < 1.0);
-    let (low, high) =
-        values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
+    let (low, high) = values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
     match has_jump {
         false => Wrap::None,
         true if low >= -1e-6 && high <= 2.0 * PI + 1e-3 => Wrap::TwoPi,
@@ -148,23 +146,16 @@ fn time_actions(suggestion: &mut Suggestion, survey: &Survey, series: &StreamSer
         .filter(|&index| suggestion.contract.stream[index].role != Some(RoleSpec::Action))
         .filter(|index| series.contains_key(index))
         .collect();
-    let kinds: Vec<(KindSpec, Option<Wrap>, Option<String>)> = suggestion
-        .contract
-        .stream
-        .iter()
-        .map(|stream| (stream.kind, stream.wrap, stream.unit.clone()))
-        .collect();
+    let kinds: Vec<(KindSpec, Option<Wrap>, Option<String>)> =
+        suggestion.contract.stream.iter().map(|stream| (stream.kind, stream.wrap, stream.unit.clone())).collect();
     let tick_hz = suggestion.contract.ticks.rate_hz.unwrap_or(10.0);
     for (index, stream) in suggestion.contract.stream.iter_mut().enumerate() {
         if stream.role != Some(RoleSpec::Action) || stream.topic.is_none() {
             continue;
         }
         let columns = series.get(&index).map_or(&[][..], Vec::as_slice);
-        let found: Vec<(usize, Following)> = columns
-            .iter()
-            .take(MAX_COLUMNS)
-            .filter_map(|column| best_state(column, &states, series))
-            .collect();
+        let found: Vec<(usize, Following)> =
+            columns.iter().take(MAX_COLUMNS).filter_map(|column| best_state(column, &states, series)).collect();
         let reasons = &mut suggestion.stream_reasons[index];
         let topic = stream.topic.as_deref().and_then(|topic| survey.topics.get(topic));
         let rate_hz = topic.map_or(0.0, super::survey::Topic::rate_hz);
@@ -198,21 +189,14 @@ fn apply(
     let name = stream.topic.clone().unwrap_or_default();
     let is_delta = super::names::is_delta(&name);
     let n_velocity = found.iter().filter(|(_, following)| following.is_velocity).count();
-    let is_velocity =
-        !is_delta && (2 * n_velocity > found.len() || (found.is_empty() && super::names::is_velocity(&name)));
+    let is_velocity = !is_delta && (2 * n_velocity > found.len() || (found.is_empty() && super::names::is_velocity(&name)));
     let is_told = 2 * found.len() >= n_columns.max(1);
     if is_told {
         let mut lags: Vec<f64> = found.iter().map(|(_, following)| following.lag_s * 1e3).collect();
         lags.sort_by(f64::total_cmp);
         let lag_ms = lags[lags.len() / 2];
         let correlation = found.iter().map(|(_, f)| f.correlation).fold(f64::INFINITY, f64::min);
-        let what = if is_delta {
-            "step"
-        } else if is_velocity {
-            "velocity"
-        } else {
-            "position"
-        };
+        let what = if is_delta { "step" } else if is_velocity { "velocity" } else { "position" };
         stream.offset_ms = if lag_ms >= 1.0 { (lag_ms * 10.0).round() / 10.0 } else { 0.0 };
         reasons.push(format!(
             "offset: the state follows this {what} command after {lag_ms:.1} ms (correlation of {} of {n_columns} columns at least {correlation:.2}), so it acts that much later",
@@ -222,9 +206,7 @@ fn apply(
             adopt_kind(stream, reasons, found, kinds);
         }
     } else {
-        reasons.push(
-            "offset: no clear delay between this command and the state; 0 until you know better".to_owned(),
-        );
+        reasons.push("offset: no clear delay between this command and the state; 0 until you know better".to_owned());
     }
     if is_velocity && stream.unit.is_none() && stream.kind == KindSpec::Linear && is_told {
         let state = found.first().map(|(state, _)| &kinds[*state]);
@@ -237,9 +219,7 @@ fn apply(
     if commands_per_tick >= 1.5 {
         action.timing = ActionTimingSpec::Window;
         let reduce = match (is_delta, is_velocity, stream.kind) {
-            (true, _, KindSpec::Rotvec | KindSpec::Quaternion | KindSpec::Matrix | KindSpec::Euler) => {
-                ReduceSpec::Compose
-            }
+            (true, _, KindSpec::Rotvec | KindSpec::Quaternion | KindSpec::Matrix | KindSpec::Euler) => ReduceSpec::Compose,
             (true, ..) => ReduceSpec::Sum,
             (false, true, KindSpec::Linear | KindSpec::Angle) => ReduceSpec::Mean,
             _ => ReduceSpec::Last,

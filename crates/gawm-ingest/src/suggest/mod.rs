@@ -75,11 +75,7 @@ pub struct Suggestion {
 ///
 /// # Errors
 /// No log can be read, or none of their topics can be mapped.
-pub fn suggest(
-    inputs: &[PathBuf],
-    library: &SchemaLibrary,
-    options: &OpenOptions,
-) -> Result<Suggestion, SuggestError> {
+pub fn suggest(inputs: &[PathBuf], library: &SchemaLibrary, options: &OpenOptions) -> Result<Suggestion, SuggestError> {
     let survey = survey::survey(inputs, library, options)?;
     let mut suggestion = guess::guess(&survey, library);
     if suggestion.contract.stream.is_empty() {

@@ -27,21 +27,8 @@ fn has(name: &str, wanted: &[&str]) -> bool {
 
 /// Words that commands go by.
 const COMMAND: [&str; 15] = [
-    "command",
-    "commands",
-    "cmd",
-    "cmds",
-    "action",
-    "actions",
-    "target",
-    "targets",
-    "setpoint",
-    "setpoints",
-    "desired",
-    "goal",
-    "reference",
-    "ctrl",
-    "control",
+    "command", "commands", "cmd", "cmds", "action", "actions", "target", "targets", "setpoint", "setpoints", "desired",
+    "goal", "reference", "ctrl", "control",
 ];
 
 pub(crate) fn is_command(name: &str) -> bool {
@@ -73,17 +60,8 @@ pub(crate) fn is_housekeeping(topic: &str, type_name: &str) -> bool {
     let bare = type_name.rsplit(['/', '.']).next().unwrap_or("");
     matches!(
         bare,
-        "Log"
-            | "ParameterEvent"
-            | "WriteSplitEvent"
-            | "DiagnosticArray"
-            | "TFMessage"
-            | "FrameTransform"
-            | "FrameTransforms"
-            | "CameraInfo"
-            | "CameraCalibration"
-            | "Clock"
-            | "Statistics"
+        "Log" | "ParameterEvent" | "WriteSplitEvent" | "DiagnosticArray" | "TFMessage" | "FrameTransform"
+            | "FrameTransforms" | "CameraInfo" | "CameraCalibration" | "Clock" | "Statistics"
     ) || topic.ends_with("/clock")
         || matches!(topic, "/rosout" | "/rosout_agg" | "/parameter_events" | "/tf" | "/tf_static")
 }
@@ -95,22 +73,8 @@ pub(crate) fn is_bookkeeping(path: &str) -> bool {
     matches!(first, "header" | "stamp" | "timestamp" | "layout")
         || matches!(
             last,
-            "t" | "time"
-                | "sec"
-                | "secs"
-                | "nsec"
-                | "nsecs"
-                | "nanosec"
-                | "nanos"
-                | "seconds"
-                | "seq"
-                | "sequence"
-                | "stamp"
-                | "timestamp"
-                | "id"
-                | "index"
-                | "frame_id"
-                | "counter"
+            "t" | "time" | "sec" | "secs" | "nsec" | "nsecs" | "nanosec" | "nanos" | "seconds" | "seq" | "sequence"
+                | "stamp" | "timestamp" | "id" | "index" | "frame_id" | "counter"
         )
         || path.contains("covariance")
 }
@@ -122,11 +86,7 @@ mod tests {
     #[test]
     fn words_of_names() {
         assert_eq!(words("/arm/JointCommand_2"), ["arm", "joint", "command", "2"]);
-        assert!(
-            is_command("/cell/velocity_command") && is_command("/cmd_vel") && !is_command("/recommended")
-        );
-        assert!(
-            is_bookkeeping("header.stamp.sec") && is_bookkeeping("t") && !is_bookkeeping("pose.position.x")
-        );
+        assert!(is_command("/cell/velocity_command") && is_command("/cmd_vel") && !is_command("/recommended"));
+        assert!(is_bookkeeping("header.stamp.sec") && is_bookkeeping("t") && !is_bookkeeping("pose.position.x"));
     }
 }

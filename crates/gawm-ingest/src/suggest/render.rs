@@ -17,16 +17,11 @@ pub(crate) fn render(suggestion: &Suggestion) -> String {
 fn write(text: &mut String, suggestion: &Suggestion) -> std::fmt::Result {
     let contract = &suggestion.contract;
     let defaults = Contract::default();
-    writeln!(
-        text,
-        "# A first contract, guessed from the logs: every comment is the reason of the guess below it."
-    )?;
+    writeln!(text, "# A first contract, guessed from the logs: every comment is the reason of the guess below it.")?;
     writeln!(text, "# Read it, correct it, then: gawm-ingest run --config THIS.toml --out DATASET LOG...")?;
     writeln!(text, "# docs/contract.md says what every key means.\n")?;
     writeln!(text, "version = 1")?;
-    if contract.disorder_window_ms != defaults.disorder_window_ms
-        || suggestion.reasons.contains_key("disorder_window_ms")
-    {
+    if contract.disorder_window_ms != defaults.disorder_window_ms || suggestion.reasons.contains_key("disorder_window_ms") {
         comments(text, suggestion.reasons.get("disorder_window_ms"))?;
         writeln!(text, "disorder_window_ms = {:?}", contract.disorder_window_ms)?;
     }

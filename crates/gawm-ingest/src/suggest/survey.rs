@@ -7,10 +7,10 @@ use std::sync::Arc;
 use bytes::Bytes;
 
 use super::SuggestError;
-use crate::decode::{DecodePlan, Decoded, FieldInfo, RowSink, SchemaLibrary, StampSource, sample_fields};
+use crate::decode::{Decoded, DecodePlan, FieldInfo, RowSink, SchemaLibrary, StampSource, sample_fields};
 use crate::inspect::{ChannelProbe, ChannelReport, MessageProbe, inspect_log};
 use crate::log::{Channel, Log, OpenOptions, discover};
-use crate::run::{OpenRecording, schema_of};
+use crate::run::{OpenRecording, Source, schema_of};
 
 /// Payloads that are kept per topic.
 const SAMPLES: usize = 48;
@@ -87,8 +87,7 @@ impl Topic {
     /// Returns the interval that one percent of the messages exceed, in ms.
     pub(crate) fn slow_ms(&self) -> f64 {
         let rate = self.report.publish_rate.as_ref().filter(|_| self.report.has_publish_clock);
-        rate.or(self.report.rate.as_ref())
-            .map_or(0.0, |rate| if rate.min_hz > 0.0 { 1e3 / rate.min_hz } else { 0.0 })
+        rate.or(self.report.rate.as_ref()).map_or(0.0, |rate| if rate.min_hz > 0.0 { 1e3 / rate.min_hz } else { 0.0 })
     }
 
     pub(crate) fn type_name(&self) -> &str {
@@ -97,11 +96,7 @@ impl Topic {
 }
 
 /// Looks at all logs.
-pub(crate) fn survey(
-    inputs: &[PathBuf],
-    library: &SchemaLibrary,
-    options: &OpenOptions,
-) -> Result<Survey, SuggestError> {
+pub(crate) fn survey(inputs: &[PathBuf], library: &SchemaLibrary, options: &OpenOptions) -> Result<Survey, SuggestError> {
     let found = discover(inputs);
     let mut reasons: Vec<String> = found.refused.iter().map(ToString::to_string).collect();
     let mut hint = found.refused.first().and_then(|error| error.hint());
@@ -121,22 +116,20 @@ pub(crate) fn survey(
             }
         };
         recordings += 1;
-        let open = OpenRecording::of(recording.name.clone(), logs);
+        let sources = logs.into_iter().map(|log| Source::Log(Box::new(log))).collect();
+        let open = OpenRecording::of(recording.name.clone(), sources);
         let mut seen: BTreeMap<String, Topic> = BTreeMap::new();
-        for log in &open.logs {
+        for log in open.logs.iter().filter_map(Source::log) {
             for report in inspect_log(log, log.path(), &probe).channels {
                 add_report(&mut seen, report, &open);
             }
         }
         steps.look(&open);
         for (name, topic) in seen {
-            topics
-                .entry(name)
-                .and_modify(|known| {
-                    known.messages += topic.messages;
-                    known.recordings += 1;
-                })
-                .or_insert(topic);
+            topics.entry(name).and_modify(|known| {
+                known.messages += topic.messages;
+                known.recordings += 1;
+            }).or_insert(topic);
         }
         if first.is_none() {
             first = Some(open);
@@ -146,7 +139,7 @@ pub(crate) fn survey(
     collect_samples(&first, &mut topics, library);
     let spans = topics.values().filter(|topic| topic.span_ns.0 > 0).map(|topic| topic.span_ns);
     let span_ns = spans.fold((i64::MAX, i64::MIN), |all, span| (all.0.min(span.0), all.1.max(span.1)));
-    let metadata = first.logs.iter().flat_map(Log::metadata);
+    let metadata = first.logs.iter().flat_map(Source::metadata);
     let metadata = metadata.map(|record| (record.name.clone(), record.values.clone())).collect();
     let urdf = super::urdf::texts(&first, &topics, library);
     Ok(Survey {
@@ -162,11 +155,8 @@ pub(crate) fn survey(
 }
 
 fn add_report(seen: &mut BTreeMap<String, Topic>, report: ChannelReport, open: &OpenRecording) {
-    let channel =
-        open.channels.iter().find(|channel| channel.topic == report.topic && channel.id == report.id);
-    let Some(channel) = channel.or(open.channels.iter().find(|channel| channel.topic == report.topic)) else {
-        return;
-    };
+    let channel = open.channels.iter().find(|channel| channel.topic == report.topic && channel.id == report.id);
+    let Some(channel) = channel.or(open.channels.iter().find(|channel| channel.topic == report.topic)) else { return };
     let ns = |time: Option<u64>| time.and_then(|ns| i64::try_from(ns).ok());
     let span_ns = (ns(report.start_ns).unwrap_or(0), ns(report.end_ns).unwrap_or(0));
     match seen.get_mut(&report.topic) {
@@ -225,7 +215,7 @@ impl Steps {
     /// A step back is a reset when the topic then goes on from there, over times that it has been through before.
     fn look(&mut self, open: &OpenRecording) {
         let mut times: BTreeMap<String, Vec<i64>> = BTreeMap::new();
-        for (part, log) in open.logs.iter().enumerate() {
+        for (part, log) in open.logs.iter().filter_map(Source::log).enumerate() {
             if log.channels().len() > 10_000 || part > 64 {
                 continue;
             }

@@ -7,7 +7,7 @@ use regex::Regex;
 use super::survey::Topic;
 use crate::decode::{SchemaLibrary, decode_to_json};
 use crate::log::Log;
-use crate::run::{OpenRecording, schema_of};
+use crate::run::{OpenRecording, Source, schema_of};
 
 /// Largest description that is read.
 const MAX_BYTES: u64 = 16 << 20;
@@ -22,20 +22,14 @@ pub(crate) struct Joint {
 }
 
 /// Returns the texts of robot descriptions in attachments and topics.
-pub(crate) fn texts(
-    open: &OpenRecording,
-    topics: &BTreeMap<String, Topic>,
-    library: &SchemaLibrary,
-) -> Vec<String> {
+pub(crate) fn texts(open: &OpenRecording, topics: &BTreeMap<String, Topic>, library: &SchemaLibrary) -> Vec<String> {
     let mut texts = Vec::new();
-    for log in &open.logs {
+    for log in open.logs.iter().filter_map(Source::log) {
         texts.extend(of_log(log));
     }
     for topic in topics.values().filter(|topic| topic.channel.topic.ends_with("robot_description")) {
-        let message =
-            topic.samples.first().and_then(|s| decode_to_json(&schema_of(&topic.channel), s, library).ok());
-        let text =
-            message.as_ref().and_then(|message| message.get("data")).and_then(serde_json::Value::as_str);
+        let message = topic.samples.first().and_then(|s| decode_to_json(&schema_of(&topic.channel), s, library).ok());
+        let text = message.as_ref().and_then(|message| message.get("data")).and_then(serde_json::Value::as_str);
         texts.extend(text.map(str::to_owned));
     }
     texts.retain(|text| text.contains("<robot"));
@@ -57,8 +51,7 @@ pub(crate) fn joints(texts: &[String]) -> (BTreeMap<String, Joint>, Vec<String>)
     let limit = Regex::new(r#"<limit\b([^>]*)/?>"#).expect("a valid expression");
     for text in texts {
         for found in joint.captures_iter(text) {
-            let (Some(name), Some(kind)) = (attribute(&found[1], "name"), attribute(&found[1], "type"))
-            else {
+            let (Some(name), Some(kind)) = (attribute(&found[1], "name"), attribute(&found[1], "type")) else {
                 continue;
             };
             let ends = limit.captures(&found[2]).and_then(|limit| {

@@ -9,6 +9,7 @@
 //!   transformers 4 or 5. A pickle is read by a machine that builds tensors and containers and refuses all else.
 //! - [`export`]: the model alone, as `safetensors.torch.load_file` and `load_state_dict` take it.
 
+mod archive;
 mod layout;
 mod pickle;
 mod safetensors;
@@ -79,30 +80,30 @@ struct OptimizerEntry {
 #[non_exhaustive]
 pub enum CheckpointError {
     /// The file system refuses.
-    #[error("cannot {verb} checkpoint {path:?}: {source}")]
+    #[error("cannot {verb} checkpoint {path:?}: {cause}")]
     Io {
         /// `read` or `write`.
         verb: &'static str,
         /// The file.
         path: PathBuf,
         /// The cause.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// The file is no safetensors file.
-    #[error("damaged checkpoint {path:?}: {source}")]
+    #[error("damaged checkpoint {path:?}: {cause}")]
     Format {
         /// The file.
         path: PathBuf,
         /// The cause.
-        source: FormatError,
+        cause: FormatError,
     },
     /// The file is no PyTorch file of tensors.
-    #[error("cannot import {path:?}: {source}")]
+    #[error("cannot import {path:?}: {cause}")]
     Torch {
         /// The file.
         path: PathBuf,
         /// The cause.
-        source: TorchError,
+        cause: Box<TorchError>,
     },
     /// The file was not written by [`save`], or by another version.
     #[error(
@@ -125,28 +126,28 @@ pub enum CheckpointError {
         message: String,
     },
     /// The sizes make no model.
-    #[error("checkpoint {path:?}: {source}")]
+    #[error("checkpoint {path:?}: {cause}")]
     Config {
         /// The file.
         path: PathBuf,
         /// The cause.
-        source: ConfigError,
+        cause: ConfigError,
     },
     /// A tensor does not belong to the model, is missing, or holds what no weight can be.
-    #[error("checkpoint {path:?}: {source}")]
+    #[error("checkpoint {path:?}: {cause}")]
     Parameter {
         /// The file.
         path: PathBuf,
         /// The cause.
-        source: ParameterError,
+        cause: Box<ParameterError>,
     },
     /// The optimiser's state does not fit.
-    #[error("checkpoint {path:?}: {source}")]
+    #[error("checkpoint {path:?}: {cause}")]
     Optimizer {
         /// The file.
         path: PathBuf,
         /// The cause.
-        source: OptimizerError,
+        cause: Box<OptimizerError>,
     },
     /// Tensors of which no published model consists.
     #[error("cannot import {path:?}: {message}")]
@@ -157,7 +158,7 @@ pub enum CheckpointError {
         message: String,
     },
     /// candle failed.
-    #[error("tensor operation failed: {0}")]
+    #[error(transparent)]
     Candle(#[from] candle_core::Error),
 }
 
@@ -252,7 +253,8 @@ fn load_optimizer(
     entry: OptimizerEntry,
     model: &WorldModel,
 ) -> Result<AdamW, CheckpointError> {
-    let refuse = |source: OptimizerError| CheckpointError::Optimizer { path: path.to_owned(), source };
+    let refuse =
+        |cause: OptimizerError| CheckpointError::Optimizer { path: path.to_owned(), cause: Box::new(cause) };
     let shapes: Vec<(String, Vec<usize>)> =
         file.shapes().filter(|(name, _)| name.starts_with(PREFIX_OPTIMIZER)).collect();
     let mut state = BTreeMap::new();
@@ -282,14 +284,14 @@ fn load_optimizer(
 /// - [`CheckpointError::Torch`] for pickles that hold anything but tensors, and as [`load`].
 pub fn import(path: &Path, options: &ImportOptions, device: &Device) -> Result<WorldModel, CheckpointError> {
     let is_zip = {
-        let io = |source| CheckpointError::Io { verb: "read", path: path.to_owned(), source };
+        let io = |cause| CheckpointError::Io { verb: "read", path: path.to_owned(), cause };
         let mut magic = Vec::new();
         let file = std::fs::File::open(path).map_err(io)?;
         std::io::Read::read_to_end(&mut std::io::Read::take(file, 4), &mut magic).map_err(io)?;
         magic == *b"PK\x03\x04"
     };
     if is_zip {
-        let refuse = |source| CheckpointError::Torch { path: path.to_owned(), source };
+        let refuse = |cause| CheckpointError::Torch { path: path.to_owned(), cause: Box::new(cause) };
         let mut archive = torch::TorchFile::open(path).map_err(refuse)?;
         let shapes: Vec<(String, Vec<usize>)> = archive.shapes().collect();
         import_tensors(path, None, shapes, options, device, |name| archive.read(name).map_err(refuse))
@@ -323,7 +325,7 @@ fn import_tensors(
         None => {
             let shapes = named.iter().map(|(ours, (_, shape))| (ours.clone(), shape.clone())).collect();
             let (config, widths) = layout::infer(&shapes, options).map_err(refuse)?;
-            let invalid = |source| CheckpointError::Config { path: path.to_owned(), source };
+            let invalid = |cause| CheckpointError::Config { path: path.to_owned(), cause };
             config.resolve(widths).map_err(invalid)?
         }
     };
@@ -351,7 +353,7 @@ fn read_architecture(
     path: &Path,
     metadata: &BTreeMap<String, String>,
 ) -> Result<Option<Architecture>, CheckpointError> {
-    let invalid = |source| CheckpointError::Config { path: path.to_owned(), source };
+    let invalid = |cause| CheckpointError::Config { path: path.to_owned(), cause };
     metadata.get(KEY_ARCHITECTURE).map(|text| Architecture::from_json(text).map_err(invalid)).transpose()
 }
 
@@ -365,7 +367,7 @@ fn fill(
     device: &Device,
     mut read: impl FnMut(&str) -> Result<Tensor, CheckpointError>,
 ) -> Result<WorldModel, CheckpointError> {
-    let refuse = |source| CheckpointError::Parameter { path: path.to_owned(), source };
+    let refuse = |cause| CheckpointError::Parameter { path: path.to_owned(), cause: Box::new(cause) };
     let specs: Specs = WorldModel::specs(&architecture);
     let mut names = BTreeMap::new();
     for (ours, theirs, got) in tensors {
@@ -397,8 +399,9 @@ fn finite(path: &Path, name: &str, tensor: Tensor) -> Result<Tensor, CheckpointE
     match values.iter().position(|value| !value.is_finite()) {
         None => Ok(tensor),
         Some(index) => {
-            let source = ParameterError::NonFinite { name: name.to_owned(), index, got: values[index] };
-            Err(CheckpointError::Parameter { path: path.to_owned(), source })
+            let cause =
+                Box::new(ParameterError::NonFinite { name: name.to_owned(), index, got: values[index] });
+            Err(CheckpointError::Parameter { path: path.to_owned(), cause })
         }
     }
 }

@@ -70,7 +70,7 @@ pub enum FormatError {
         /// The tensor.
         name: String,
         /// Its shape.
-        shape: Vec<usize>,
+        shape: Box<[usize]>,
         /// Bytes that shape and type need; `None` beyond 64 bits.
         expected: MaybeBytes,
         /// Where it states to be.
@@ -114,9 +114,12 @@ pub(super) struct TensorFile {
     path: PathBuf,
     file: File,
     data_start: u64,
-    metadata: BTreeMap<String, String>,
-    entries: BTreeMap<String, Entry>,
+    metadata: Metadata,
+    entries: Entries,
 }
+
+type Metadata = BTreeMap<String, String>;
+type Entries = BTreeMap<String, Entry>;
 
 #[derive(Debug, Clone)]
 struct Entry {
@@ -167,8 +170,8 @@ impl<'de> Deserialize<'de> for RawHeader {
 impl TensorFile {
     /// Opens a file and checks its header against its length.
     pub(super) fn open(path: &Path) -> Result<TensorFile, CheckpointError> {
-        let io = |source| CheckpointError::Io { verb: "read", path: path.to_owned(), source };
-        let format = |source| CheckpointError::Format { path: path.to_owned(), source };
+        let io = |cause| CheckpointError::Io { verb: "read", path: path.to_owned(), cause };
+        let format = |cause| CheckpointError::Format { path: path.to_owned(), cause };
         let mut file = File::open(path).map_err(io)?;
         let length = file.metadata().map_err(io)?.len();
         if length < 8 {
@@ -201,7 +204,7 @@ impl TensorFile {
 
     /// Reads one tensor to the CPU.
     pub(super) fn read(&mut self, name: &str) -> Result<Tensor, CheckpointError> {
-        let io = |source| CheckpointError::Io { verb: "read", path: self.path.clone(), source };
+        let io = |cause| CheckpointError::Io { verb: "read", path: self.path.clone(), cause };
         let missing = || candle_core::Error::CannotFindTensor { path: name.to_owned() };
         let entry = self.entries.get(name).ok_or_else(missing)?;
         let mut bytes = vec![0; (entry.end - entry.begin) as usize];
@@ -211,10 +214,7 @@ impl TensorFile {
     }
 }
 
-fn parse_header(
-    header: &[u8],
-    data_bytes: u64,
-) -> Result<(BTreeMap<String, String>, BTreeMap<String, Entry>), FormatError> {
+fn parse_header(header: &[u8], data_bytes: u64) -> Result<(Metadata, Entries), FormatError> {
     let malformed = |error: serde_json::Error| FormatError::Header { message: error.to_string() };
     let raw: RawHeader = serde_json::from_slice(header).map_err(malformed)?;
     let mut entries = BTreeMap::new();
@@ -255,7 +255,7 @@ fn check_entry(name: &str, raw: RawEntry) -> Result<Entry, FormatError> {
     if expected.is_none() || end.checked_sub(begin) != expected {
         return Err(FormatError::Size {
             name: name.to_owned(),
-            shape: raw.shape,
+            shape: raw.shape.into(),
             expected: MaybeBytes(expected),
             offsets: raw.data_offsets,
         });
@@ -275,7 +275,7 @@ pub(super) fn write(
     metadata: &BTreeMap<String, String>,
     tensors: &BTreeMap<String, Tensor>,
 ) -> Result<(), CheckpointError> {
-    let io = |source| CheckpointError::Io { verb: "write", path: path.to_owned(), source };
+    let io = |cause| CheckpointError::Io { verb: "write", path: path.to_owned(), cause };
     let mut name = path.file_name().ok_or_else(|| io(std::io::ErrorKind::InvalidInput.into()))?.to_owned();
     name.push(format!(".tmp-{}", std::process::id()));
     let temporary = path.with_file_name(name);
@@ -293,7 +293,7 @@ fn write_to(
     metadata: &BTreeMap<String, String>,
     tensors: &BTreeMap<String, Tensor>,
 ) -> Result<(), CheckpointError> {
-    let io = |source| CheckpointError::Io { verb: "write", path: path.to_owned(), source };
+    let io = |cause| CheckpointError::Io { verb: "write", path: path.to_owned(), cause };
     let mut header = serde_json::Map::new();
     header.insert("__metadata__".to_owned(), serde_json::json!(metadata));
     let mut offset = 0;

@@ -1,14 +1,12 @@
 //! PyTorch files (`torch.save` of a state dict): a zip archive of a pickle and one file per storage.
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{BufReader, Read};
 use std::path::Path;
 
 use candle_core::{Device, Tensor};
 use thiserror::Error;
-use zip::{CompressionMethod, ZipArchive};
 
+use super::archive::Archive;
 use super::pickle::{PickleError, TensorRecord, read_state_dict};
 
 /// Longest pickle that is read; that of a state dict of a thousand tensors has 200 kB.
@@ -19,11 +17,20 @@ const MAX_PICKLE_BYTES: u64 = 16 << 20;
 #[non_exhaustive]
 pub enum TorchError {
     /// The file system or the archive refuses.
-    #[error("{0}")]
+    #[error(transparent)]
     Io(#[from] std::io::Error),
     /// The archive is damaged.
-    #[error("damaged archive: {0}")]
-    Zip(#[from] zip::result::ZipError),
+    #[error("damaged archive: {message}")]
+    Archive {
+        /// What is wrong.
+        message: &'static str,
+    },
+    /// The bytes of an entry are not those that were written.
+    #[error("damaged entry {name:?}: wrong checksum")]
+    Checksum {
+        /// The entry.
+        name: String,
+    },
     /// The archive has no pickle, or several.
     #[error("expected one data.pkl in the archive, got {got}")]
     NoPickle {
@@ -72,13 +79,13 @@ pub enum TorchError {
         name: String,
     },
     /// candle failed.
-    #[error("tensor operation failed: {0}")]
+    #[error(transparent)]
     Candle(#[from] candle_core::Error),
 }
 
 /// An open file whose pickle has been read; tensors are read one by one.
 pub(super) struct TorchFile {
-    archive: ZipArchive<BufReader<File>>,
+    archive: Archive,
     folder: String,
     records: BTreeMap<String, TensorRecord>,
 }
@@ -86,22 +93,21 @@ pub(super) struct TorchFile {
 impl TorchFile {
     /// Opens an archive and runs its pickle.
     pub(super) fn open(path: &Path) -> Result<TorchFile, TorchError> {
-        let mut archive = ZipArchive::new(BufReader::new(File::open(path)?))?;
-        let names = archive.file_names().map(|name| Ok(name?.into_owned()));
-        let mut pickles: Vec<String> = names.collect::<Result<_, TorchError>>()?;
-        pickles.retain(|name| name.ends_with("/data.pkl"));
-        let [pickle] = pickles.as_slice() else {
+        let mut archive = Archive::open(path)?;
+        let pickles: Vec<&str> = archive.names().filter(|name| name.ends_with("/data.pkl")).collect();
+        let &[pickle] = pickles.as_slice() else {
             return Err(TorchError::NoPickle { got: pickles.len() });
         };
+        let pickle = pickle.to_owned();
         let folder = pickle.trim_end_matches("data.pkl").to_owned();
         let byte_order = format!("{folder}byteorder");
-        if archive.index_for_name(&byte_order).is_some() {
-            let order = read_entry(&mut archive, &byte_order, Wanted::AtMost(16))?;
+        if archive.contains(&byte_order) {
+            let order = archive.read(&byte_order, 0..=16)?;
             if order != b"little" {
                 return Err(TorchError::ByteOrder { got: String::from_utf8_lossy(&order).into_owned() });
             }
         }
-        let program = read_entry(&mut archive, pickle, Wanted::AtMost(MAX_PICKLE_BYTES))?;
+        let program = archive.read(&pickle, 0..=MAX_PICKLE_BYTES)?;
         let records: BTreeMap<String, TensorRecord> = read_state_dict(&program)?.into_iter().collect();
         for (name, record) in &records {
             check_view(name, record)?;
@@ -120,43 +126,10 @@ impl TorchFile {
         let record = self.records.get(name).ok_or_else(missing)?;
         let expected = record.storage_len as u64 * record.dtype.size_in_bytes() as u64; // checked by `check_view`
         let storage = format!("{}data/{}", self.folder, record.storage);
-        let bytes = read_entry(&mut self.archive, &storage, Wanted::Exactly(expected))?;
+        let bytes = self.archive.read(&storage, expected..=expected)?;
         let bytes = gather(&bytes, record);
         Ok(Tensor::from_raw_buffer(&bytes, record.dtype, &record.shape, &Device::Cpu)?)
     }
-}
-
-#[derive(Clone, Copy)]
-enum Wanted {
-    Exactly(u64),
-    AtMost(u64),
-}
-
-/// Reads a stored entry of a size known before.
-fn read_entry(
-    archive: &mut ZipArchive<BufReader<File>>,
-    name: &str,
-    wanted: Wanted,
-) -> Result<Vec<u8>, TorchError> {
-    let entry = archive.by_name(name)?;
-    if entry.compression() != CompressionMethod::Stored {
-        return Err(TorchError::Compressed { name: name.to_owned() });
-    }
-    let got = entry.size();
-    let (fits, expected) = match wanted {
-        Wanted::Exactly(bytes) => (got == bytes, bytes),
-        Wanted::AtMost(bytes) => (got <= bytes, bytes),
-    };
-    if !fits {
-        return Err(TorchError::Size { name: name.to_owned(), expected, got });
-    }
-    // Stored bytes are in the file: reading stops at its end, whatever the directory claims.
-    let mut bytes = Vec::new();
-    entry.take(got).read_to_end(&mut bytes)?;
-    if bytes.len() as u64 != got {
-        return Err(TorchError::Size { name: name.to_owned(), expected: got, got: bytes.len() as u64 });
-    }
-    Ok(bytes)
 }
 
 /// Checks that a view lies within its storage and is no larger than it.

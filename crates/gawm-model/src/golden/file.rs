@@ -160,7 +160,7 @@ pub enum GoldenError {
     #[error(transparent)]
     Plan(#[from] PlanError),
     /// candle failed.
-    #[error("tensor operation failed: {0}")]
+    #[error(transparent)]
     Candle(#[from] candle_core::Error),
 }
 

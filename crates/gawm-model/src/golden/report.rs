@@ -121,3 +121,24 @@ impl fmt::Display for Line {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn wrong_answers_are_found() {
+        let mut report = Report::new(1.0);
+        report.values("close", &[1.0, 2.0], &[1.0, 2.0 + 2e-5], 1e-5);
+        report.values("far", &[1.0, 2.0], &[1.0, 2.1], 1e-5);
+        report.values("short", &[1.0], &[1.0, 2.0], 1e-5);
+        report.values("nothing", &[], &[], 1e-5);
+        report.values("nan", &[f64::NAN], &[1.0], 1e-5);
+        report.relative("relative", &[1e-6], &[1.1e-6], 0.05);
+        report.absolute("absolute", &[1e-6], &[1.1e-6], 0.05);
+        let failures: Vec<&str> = report.failures().map(|line| line.name.as_str()).collect();
+        assert_eq!(failures, ["far", "short", "nothing", "nan", "relative"]);
+        assert_eq!(report.worst("far").map(|line| (line.index, line.expected)), Some((1, 2.1)));
+        assert!(report.lines()[1].to_string().contains("element 1: expected 2.1, got 2"));
+    }
+}

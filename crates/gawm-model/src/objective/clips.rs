@@ -48,7 +48,7 @@ pub enum ClipsError {
         width: usize,
     },
     /// candle failed.
-    #[error("tensor operation failed: {0}")]
+    #[error(transparent)]
     Candle(#[from] candle_core::Error),
 }
 

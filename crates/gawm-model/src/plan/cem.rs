@@ -112,7 +112,7 @@ pub enum PlanError {
         got: usize,
     },
     /// candle failed.
-    #[error("tensor operation failed: {0}")]
+    #[error(transparent)]
     Candle(#[from] candle_core::Error),
 }
 
@@ -138,7 +138,7 @@ impl CemConfig {
 /// Searches the action sequence of lowest cost for one environment.
 ///
 /// Each iteration draws `mean + sigma * noise` with sample 0 replaced by the mean, takes the cheapest as elites, and
-/// moves mean and sigma to theirs. `cost` maps candidates [N, L, A] to costs [N].
+/// moves mean and sigma to theirs. `cost` maps candidates [N, L, A] to costs `[N]`.
 ///
 /// # Errors
 ///

@@ -47,7 +47,7 @@ pub fn rollout(model: &WorldModel, z: &Tensor, chunks: &Tensor, pass: &Pass) -> 
     Tensor::cat(&latents[n_frames..], 1) // [N, L, D]
 }
 
-/// Sum of squared differences at the last step: `predicted` [N, L, D] and `goal` [N, D] or [1, D] to [N].
+/// Sum of squared differences at the last step: `predicted` [N, L, D] and `goal` [N, D] or [1, D] to `[N]`.
 pub fn terminal_cost(predicted: &Tensor, goal: &Tensor) -> Result<Tensor> {
     let (_, l, _) = predicted.dims3()?;
     let last = predicted.narrow(1, l - 1, 1)?.squeeze(1)?; // [N, D]

@@ -151,7 +151,7 @@ const BIAS: &str = "projector.net.3.bias";
 #[test]
 fn lying_headers_are_refused() {
     let format = |error: CheckpointError| match error {
-        CheckpointError::Format { source, .. } => source,
+        CheckpointError::Format { cause, .. } => cause,
         other => panic!("{other}"),
     };
     let error = format(attacked(|header, _| header[BIAS]["data_offsets"] = serde_json::json!([0, 64])));
@@ -362,7 +362,12 @@ fn torch_files_are_imported() {
     assert_eq!(bits(&checkpoint::import(&path, &MICRO, &Device::Cpu).unwrap()), bits(&model));
     torch_file(&path, &model, zip::CompressionMethod::Deflated);
     let error = checkpoint::import(&path, &MICRO, &Device::Cpu).unwrap_err();
-    assert!(matches!(error, CheckpointError::Torch { source: TorchError::Compressed { .. }, .. }), "{error}");
+    match error {
+        CheckpointError::Torch { cause, .. } => {
+            assert!(matches!(*cause, TorchError::Compressed { .. }), "{cause}")
+        }
+        other => panic!("{other}"),
+    }
 }
 
 #[test]
