@@ -120,16 +120,6 @@ pub enum ImageError {
         /// Values there are.
         got: usize,
     },
-    /// The resizer failed.
-    #[error("cannot resize to {width}x{height}: {detail}")]
-    Resize {
-        /// Target width in pixels.
-        width: u32,
-        /// Target height in pixels.
-        height: u32,
-        /// What the resizer says.
-        detail: String,
-    },
     /// An encoder failed.
     #[error("cannot encode {format}: {detail}")]
     Encode {

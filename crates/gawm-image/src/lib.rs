@@ -24,6 +24,7 @@ mod error;
 mod format;
 mod image;
 mod raw;
+mod resample;
 mod transform;
 
 #[cfg(test)]

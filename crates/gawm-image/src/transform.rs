@@ -1,10 +1,8 @@
 //! Crop, resize, and change between colour and grey.
 
-use fast_image_resize::images::{Image as FirImage, ImageRef};
-use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
-
 use crate::error::ImageError;
 use crate::image::{Image, Limits, Pixels};
+use crate::resample::bilinear;
 
 /// A part of an image, in pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,7 +52,7 @@ fn cut<T: Copy>(values: &[T], width: usize, channels: usize, rect: CropRect) -> 
     rows.flat_map(|row| row[start..start + length].iter().copied()).collect()
 }
 
-/// Resizes an image: 8-bit pixels bilinearly with antialiasing, 16-bit and float ones to the nearest.
+/// Resizes an image: 8-bit pixels bilinearly with antialiasing, equal to Pillow's, 16-bit and float ones to the nearest.
 ///
 /// Depth is never blended: the mean of a near and a far value is a surface that is not there.
 ///
@@ -68,28 +66,12 @@ pub fn resize(image: &Image, width: u32, height: u32) -> Result<Image, ImageErro
     let from = (image.width() as usize, image.height() as usize);
     let to = (width as usize, height as usize);
     let pixels = match image.pixels() {
-        Pixels::Rgb8(values) => Pixels::Rgb8(bilinear(image, values, PixelType::U8x3, (width, height))?),
-        Pixels::Gray8(values) => Pixels::Gray8(bilinear(image, values, PixelType::U8, (width, height))?),
+        Pixels::Rgb8(values) => Pixels::Rgb8(bilinear::<3>(values, from, to)),
+        Pixels::Gray8(values) => Pixels::Gray8(bilinear::<1>(values, from, to)),
         Pixels::Gray16(values) => Pixels::Gray16(nearest(values, from, to)),
         Pixels::GrayF32(values) => Pixels::GrayF32(nearest(values, from, to)),
     };
     Image::try_new(width, height, pixels)
-}
-
-fn bilinear(
-    image: &Image,
-    values: &[u8],
-    pixel_type: PixelType,
-    (width, height): (u32, u32),
-) -> Result<Vec<u8>, ImageError> {
-    let fail = |detail: String| ImageError::Resize { width, height, detail };
-    let source =
-        ImageRef::new(image.width(), image.height(), values, pixel_type).map_err(|e| fail(e.to_string()))?;
-    let mut target = FirImage::new(width, height, pixel_type);
-    let options =
-        ResizeOptions::new().resize_alg(ResizeAlg::Convolution(FilterType::Bilinear)).use_alpha(false);
-    Resizer::new().resize(&source, &mut target, &options).map_err(|e| fail(e.to_string()))?;
-    Ok(target.into_vec())
 }
 
 /// Takes the source pixel whose area holds the centre of the target pixel.

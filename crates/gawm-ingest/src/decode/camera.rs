@@ -124,12 +124,10 @@ fn matrix<const N: usize>(value: Option<&Value>, path: &str) -> Result<[f64; N],
         return Ok([0.0; N]);
     }
     let got = items.len();
-    <[f64; N]>::try_from(items).or_else(|_| {
-        Err(DecodeError::WrongType {
-            path: path.to_owned(),
-            expected: "a 3x3 or 3x4 matrix",
-            got: format!("{got} numbers"),
-        })
+    items.first_chunk::<N>().filter(|_| got == N).copied().ok_or_else(|| DecodeError::WrongType {
+        path: path.to_owned(),
+        expected: "a 3x3 or 3x4 matrix",
+        got: format!("{got} numbers"),
     })
 }
 

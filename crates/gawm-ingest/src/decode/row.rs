@@ -133,7 +133,6 @@ pub(crate) enum Number {
 
 impl Number {
     #[inline]
-    #[expect(clippy::cast_precision_loss, reason = "features are f64; exact integers are read as values")]
     pub(crate) fn widen(self) -> f64 {
         match self {
             Self::F64(v) => v,

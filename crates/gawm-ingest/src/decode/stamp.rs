@@ -84,10 +84,6 @@ fn integer(number: Number) -> Option<i64> {
     match number {
         Number::I64(v) => Some(v),
         Number::U64(v) => i64::try_from(v).ok(),
-        #[expect(
-            clippy::cast_possible_truncation,
-            reason = "whole and within the range of i64 by the line above"
-        )]
         Number::F64(v) if v.fract() == 0.0 && v.abs() < 9e18 => Some(v as i64),
         Number::F64(_) | Number::Bool(_) => None,
     }
@@ -120,7 +116,6 @@ fn scaled(number: Number, unit: StampUnit) -> Option<i64> {
 }
 
 /// Rounds to whole nanoseconds; the whole part is scaled as an integer, so that it is exact.
-#[expect(clippy::cast_possible_truncation, clippy::cast_precision_loss, reason = "bounded by the first line")]
 fn float_to_ns(value: f64, factor: i64) -> Option<i64> {
     if !value.is_finite() || value.abs() > 9e18 {
         return None;

@@ -2,11 +2,24 @@
 
 use std::fmt;
 
+use super::{GRADIENT, GRADIENT_GLOBAL};
+
 /// The errors of a comparison.
 #[derive(Debug, Clone)]
 pub struct Report {
     lines: Vec<Line>,
-    slack: f64,
+    slack: Slack,
+}
+
+/// What tolerances are multiplied by.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Slack {
+    /// Those of forward values.
+    pub(super) values: f64,
+    /// Those of gradients and their norms.
+    pub(super) gradients: f64,
+    /// Their share of the global norm, for gradients that are zero in exact arithmetic.
+    pub(super) global: f64,
 }
 
 /// The largest error of one tensor.
@@ -27,8 +40,8 @@ pub struct Line {
 }
 
 impl Report {
-    /// `slack` multiplies every tolerance.
-    pub(super) fn new(slack: f64) -> Report {
+    /// Starts without any tensor.
+    pub(super) fn new(slack: Slack) -> Report {
         Report { lines: Vec::new(), slack }
     }
 
@@ -50,7 +63,7 @@ impl Report {
 
     /// Error |ours - reference| / (1 + |reference|).
     pub(super) fn values(&mut self, name: &str, ours: &[f64], reference: &[f64], tolerance: f64) {
-        self.push(name, ours, reference, tolerance, |reference| 1.0 + reference.abs());
+        self.push(name, ours, reference, tolerance * self.slack.values, |reference| 1.0 + reference.abs());
     }
 
     /// As [`Report::values`], of the first values of ours.
@@ -58,9 +71,14 @@ impl Report {
         self.values(name, &ours[..reference.len().min(ours.len())], reference, tolerance);
     }
 
-    /// Error |ours - reference| / |reference|.
+    /// Error |ours - reference| / |reference|, of gradients.
     pub(super) fn relative(&mut self, name: &str, ours: &[f64], reference: &[f64], tolerance: f64) {
-        self.push(name, ours, reference, tolerance, f64::abs);
+        self.push(name, ours, reference, tolerance * self.slack.gradients, f64::abs);
+    }
+
+    /// Allowed |ours - reference| of a gradient with L2 norm `norm`, in a model whose gradients have norm `global`.
+    pub(super) fn gradient_tolerance(&self, norm: f64, global: f64) -> f64 {
+        GRADIENT * self.slack.gradients * norm + GRADIENT_GLOBAL * self.slack.global * global
     }
 
     /// Error |ours - reference|.
@@ -79,7 +97,7 @@ impl Report {
         let mut line = Line {
             name: name.to_owned(),
             error: 0.0,
-            tolerance: tolerance * self.slack,
+            tolerance,
             index: 0,
             expected: reference.first().copied().unwrap_or(f64::NAN),
             got: ours.first().copied().unwrap_or(f64::NAN),
@@ -128,7 +146,7 @@ mod tests {
 
     #[test]
     fn wrong_answers_are_found() {
-        let mut report = Report::new(1.0);
+        let mut report = Report::new(Slack { values: 1.0, gradients: 1.0, global: 1.0 });
         report.values("close", &[1.0, 2.0], &[1.0, 2.0 + 2e-5], 1e-5);
         report.values("far", &[1.0, 2.0], &[1.0, 2.1], 1e-5);
         report.values("short", &[1.0], &[1.0, 2.0], 1e-5);

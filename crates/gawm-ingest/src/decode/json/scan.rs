@@ -136,7 +136,7 @@ impl<'a> Scan<'a> {
                 _ => return Err(self.malformed("an escape that JSON knows")),
             }
         }
-        String::from_utf8(out).or_else(|_| Err(self.malformed("UTF-8 text")))
+        String::from_utf8(out).map_err(|_not_text| self.malformed("UTF-8 text"))
     }
 
     /// Reads what follows `\u`, with its second half if it is one of a pair.

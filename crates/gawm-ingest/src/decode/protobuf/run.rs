@@ -443,11 +443,6 @@ fn probe<'a>(picks: &MemberPicks, data: &'a [u8], before: usize) -> Result<Probe
     Ok(Probe { held: Some(held) })
 }
 
-#[expect(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "the value came from such an integer"
-)]
 fn emit_default<'a, E: Emit<'a>>(fallback: &Fallback, emit: &mut E) {
     let Fallback { slot, prim, value } = *fallback;
     match prim {

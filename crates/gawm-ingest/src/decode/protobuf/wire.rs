@@ -168,11 +168,6 @@ pub(crate) fn fixed_size(prim: Prim, wire: Wire) -> Option<usize> {
     }
 }
 
-#[expect(
-    clippy::cast_possible_wrap,
-    clippy::cast_possible_truncation,
-    reason = "protobuf reads narrower integers from the low bits of a varint"
-)]
 fn varint_number(raw: u64, prim: Prim, wire: Wire) -> Number {
     let unzigzag = |v: u64| (v >> 1) as i64 ^ -((v & 1) as i64);
     match prim {

@@ -208,7 +208,6 @@ fn arm_logs_equal_their_truth_in_every_encoding() {
         let mut expected = truth["action"].f64();
         if is_proto {
             // This writer's gripper is a 32-bit float.
-            #[expect(clippy::cast_possible_truncation, reason = "what the writer did")]
             expected.iter_mut().skip(6).step_by(7).for_each(|v| *v = f64::from(*v as f32));
         }
         check_same(&values, &expected, file);
@@ -284,4 +283,135 @@ fn cell_log_equals_its_truth() {
         frames.iter().map(|f| format!("transforms[child_frame_id=\"{f}\"].transform")).collect();
     check("/tf", &fields.iter().map(String::as_str).collect::<Vec<_>>(), "tf", Some("tf_stamp"));
     assert_eq!(truth["tf"].shape, [600, 4, 7]);
+}
+
+/// Takes the images of one topic out of a log.
+fn images(log: &[Sample], topic: &str, mut each: impl FnMut(usize, ImageMessage<'_>)) {
+    let library = SchemaLibrary::builtin();
+    let mut sink = RowSink::new();
+    let samples = log.iter().filter(|s| s.channel.topic == topic);
+    for (i, sample) in samples.enumerate() {
+        let plan = ImagePlan::compile(&schema_of(&sample.channel), &library).unwrap();
+        each(i, plan.extract(&sample.data, &mut sink).unwrap());
+    }
+}
+
+fn pixels_of(image: &ImageMessage<'_>) -> gawm_image::Image {
+    let raw = gawm_image::RawImage {
+        layout: &image.format,
+        width: image.width,
+        height: image.height,
+        step: image.step,
+        is_big_endian: image.is_big_endian,
+        data: &image.data,
+    };
+    gawm_image::decode_raw(&raw, &gawm_image::Limits::default()).unwrap()
+}
+
+/// The swatches of the test picture stand somewhere in every frame; RGB must come back within `tolerance`.
+fn check_swatches(image: gawm_image::Image, swatches: &[[u8; 3]], tolerance: u8, name: &str) {
+    let gawm_image::Pixels::Rgb8(values) = gawm_image::to_rgb8(image).unwrap().into_pixels() else {
+        panic!("colour")
+    };
+    for swatch in swatches {
+        let near = |p: &[u8; 3]| p.iter().zip(swatch).all(|(a, b)| a.abs_diff(*b) <= tolerance);
+        let n = values.as_chunks::<3>().0.iter().filter(|p| near(p)).count();
+        assert!(n >= 30, "{name}: swatch {swatch:?} has {n} pixels");
+    }
+}
+
+#[test]
+fn cell_images_equal_their_truth() {
+    let Some(shared) = shared() else { return };
+    let folder = shared.join("corpora/cell");
+    let truth = Truth::load(&folder.join("truth/cell.npz"));
+    let info: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(folder.join("truth/cell.json")).unwrap()).unwrap();
+    let swatches: Vec<[u8; 3]> = serde_json::from_value(info["constants"]["swatches_rgb"].clone())
+        .or_else(|_| serde_json::from_value(info["swatches_rgb"].clone()))
+        .unwrap();
+    let log = messages(&folder.join("cell_mixed_zstd.mcap"));
+    let crc = |column: &str, i: usize| truth[column].i64()[i];
+    let mut layouts = std::collections::BTreeSet::new();
+    images(&log, "/cam/side/image_raw", |i, image| {
+        assert_eq!(i64::from(crc32fast::hash(&image.data)), crc("side_crc32", i));
+        assert_eq!(i64::from(image.step), crc("side_step", i));
+        if layouts.insert(image.format.to_string()) && image.format != "mono8" {
+            check_swatches(pixels_of(&image), &swatches, 4, &image.format);
+        } else {
+            pixels_of(&image);
+        }
+    });
+    assert_eq!(layouts.len(), 6);
+    let limits = gawm_image::Limits::default();
+    for (topic, column) in [("/cam/wrist/image/compressed", "wrist"), ("/cam/overhead/image", "overhead")] {
+        images(&log, topic, |i, image| {
+            assert_eq!(
+                i64::from(crc32fast::hash(&image.data)),
+                crc(&format!("{column}_crc32"), i),
+                "{topic}"
+            );
+            gawm_image::verify(&image.data).unwrap();
+            if i % 50 == 0 {
+                check_swatches(gawm_image::decode(&image.data, &limits).unwrap(), &swatches, 12, topic);
+            }
+        });
+    }
+    let depth_crc = |image: gawm_image::Image| {
+        let bytes: Vec<u8> = match image.into_pixels() {
+            gawm_image::Pixels::Gray16(values) => values.iter().flat_map(|v| v.to_le_bytes()).collect(),
+            gawm_image::Pixels::GrayF32(values) => values.iter().flat_map(|v| v.to_le_bytes()).collect(),
+            other => panic!("{}", other.name()),
+        };
+        i64::from(crc32fast::hash(&bytes))
+    };
+    images(&log, "/cam/side/depth/image_raw", |i, image| {
+        let decoded = pixels_of(&image);
+        let file = gawm_image::encode_png(&decoded).unwrap();
+        assert_eq!(depth_crc(gawm_image::decode(&file, &limits).unwrap()), crc("depth16_pixels_crc32", i));
+    });
+    images(&log, "/cam/wrist/depth/image", |i, image| {
+        let file = gawm_image::encode_tiff(&pixels_of(&image)).unwrap();
+        assert_eq!(depth_crc(gawm_image::decode(&file, &limits).unwrap()), crc("depthf_pixels_crc32", i));
+    });
+    images(&log, "/cam/overhead/depth/compressedDepth", |i, image| {
+        let depth = gawm_image::decode_compressed_depth(&image.format, &image.data, &limits).unwrap();
+        assert_eq!(depth_crc(depth), crc("depthc_pixels_crc32", i));
+    });
+}
+
+#[test]
+fn cell_calibrations_equal_their_truth() {
+    let Some(shared) = shared() else { return };
+    let folder = shared.join("corpora/cell");
+    let info: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(folder.join("truth/cell.json")).unwrap()).unwrap();
+    let log = messages(&folder.join("cell_mixed_zstd.mcap"));
+    for camera in ["wrist", "overhead", "side"] {
+        let topic = format!("/cam/{camera}/camera_info");
+        let sample = log.iter().find(|s| s.channel.topic == topic).unwrap();
+        let got =
+            CameraInfo::decode(&schema_of(&sample.channel), &sample.data, &SchemaLibrary::builtin()).unwrap();
+        let expected = &info["calibration"][camera];
+        let numbers = |key: &str| -> Vec<f64> { serde_json::from_value(expected[key].clone()).unwrap() };
+        assert_eq!((got.k.to_vec(), got.d, got.r.to_vec()), (numbers("k"), numbers("d"), numbers("r")));
+        assert_eq!(got.p.to_vec(), numbers("p"));
+        assert_eq!(u64::from(got.width), expected["width"].as_u64().unwrap());
+    }
+}
+
+#[test]
+fn corrupt_jpegs_are_refused_and_the_others_decode() {
+    let Some(shared) = shared() else { return };
+    let log = messages(&shared.join("corpora/generated/bad_corrupt_jpegs.mcap"));
+    let limits = gawm_image::Limits::default();
+    let mut bad = Vec::new();
+    images(&log, "/camera/image/compressed", |i, image| {
+        let decoded = gawm_image::decode(&image.data, &limits);
+        assert_eq!(decoded.is_err(), gawm_image::verify(&image.data).is_err(), "image {i}");
+        if decoded.is_err() {
+            bad.push(i);
+        }
+    });
+    assert_eq!(bad, [15, 60, 105, 150]);
 }

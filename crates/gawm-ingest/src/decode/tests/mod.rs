@@ -2,6 +2,8 @@
 
 mod cdr;
 mod corpora;
+mod damage;
+mod messages;
 
 use std::path::PathBuf;
 
