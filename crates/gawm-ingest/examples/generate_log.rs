@@ -49,7 +49,7 @@ impl Cdr {
         self.0.extend([0, 1, 0, 0]);
     }
     fn align(&mut self, to: usize) {
-        while (self.0.len() - 4) % to != 0 {
+        while !(self.0.len() - 4).is_multiple_of(to) {
             self.0.push(0);
         }
     }

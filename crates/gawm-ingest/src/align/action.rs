@@ -21,7 +21,7 @@ pub(crate) fn reduced(
         for start in (at..at + part.width).step_by(raw) {
             let column = || (0..n).map(|row| &commands[row * width + start..row * width + start + raw]);
             match (reduction, part.kind) {
-                (Reduction::Last, _) => out.extend(column().last().into_iter().flatten()),
+                (Reduction::Last, _) => out.extend(column().next_back().into_iter().flatten()),
                 (Reduction::Mean, Kind::Angle { wrap }) if wrap != Wrap::None => {
                     let (sin, cos) = column().fold((0.0, 0.0), |(s, c), v| (s + v[0].sin(), c + v[0].cos()));
                     out.push(wrapped(sin.atan2(cos), wrap));

@@ -361,7 +361,7 @@ proptest! {
             for (k, row) in rows.iter().enumerate() {
                 let tick = row.time_ns as f64 / MS as f64;
                 let newest = |stream: usize| {
-                    samples.iter().filter(|s| s.0 == stream && (s.1 * MS as f64) as i64 <= row.time_ns).next_back().map(|s| s.2)
+                    samples.iter().rfind(|s| s.0 == stream && (s.1 * MS as f64) as i64 <= row.time_ns).map(|s| s.2)
                 };
                 for stream in 0..2 {
                     prop_assert!(row.values[stream] <= tick + 1e-5);

@@ -182,9 +182,9 @@ impl Labels {
             LabelSource::Topic(source) => {
                 let key = (source.topic.clone(), source.field.clone());
                 let values = recording.values.get(&key)?;
-                let within = values.iter().filter(|(ns, _)| *ns > asked.start_ns && *ns <= asked.end_ns);
+                let mut within = values.iter().filter(|(ns, _)| *ns > asked.start_ns && *ns <= asked.end_ns);
                 let found = if label == "success" {
-                    within.last()
+                    within.next_back()
                 } else {
                     let before = values.iter().rev().find(|(ns, _)| *ns <= asked.start_ns);
                     before

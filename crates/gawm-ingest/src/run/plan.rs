@@ -28,13 +28,13 @@ pub(crate) fn schema_of(channel: &Channel) -> ChannelSchema<'_> {
 #[derive(Debug)]
 pub(crate) enum VectorDecoder {
     /// The message itself holds them.
-    Direct(DecodePlan),
+    Direct(Box<DecodePlan>),
     /// A text of the message holds them as JSON, as `std_msgs/String` often does.
     Text {
         /// Takes the text.
-        text: DecodePlan,
+        text: Box<DecodePlan>,
         /// Decodes it.
-        inner: DecodePlan,
+        inner: Box<DecodePlan>,
         /// Where the text is.
         prefix: String,
     },
@@ -60,7 +60,7 @@ pub(crate) fn compile_vector(
         Clock::Field(path) => StampSource::Path { path: path.parse()?, unit: StampUnit::Auto },
     };
     match DecodePlan::compile_with(channel, fields, &stamp, library) {
-        Ok(plan) => Ok(VectorDecoder::Direct(plan)),
+        Ok(plan) => Ok(VectorDecoder::Direct(Box::new(plan))),
         Err(error) => compile_text(channel, fields, &stamp, library).unwrap_or(Err(error)),
     }
 }
@@ -90,7 +90,11 @@ fn compile_text(
         other => other.clone(),
     };
     let inner = DecodePlan::compile_with(&json, &rest?, &stamp, library);
-    Some(inner.map(|inner| VectorDecoder::Text { text, inner, prefix: first.clone() }))
+    Some(inner.map(|inner| VectorDecoder::Text {
+        text: Box::new(text),
+        inner: Box::new(inner),
+        prefix: first.clone(),
+    }))
 }
 
 impl VectorDecoder {

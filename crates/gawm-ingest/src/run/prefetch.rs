@@ -69,7 +69,7 @@ pub(crate) fn in_order<T: Send, E>(
         for _ in 0..n_threads.min(costs.len()) {
             scope.spawn(|| worker(&shared, costs, budget_bytes, &work));
         }
-        for index in 0..costs.len() {
+        for (index, &cost) in costs.iter().enumerate() {
             let mut state = shared.lock();
             let result = loop {
                 if let Some(result) = state.done.remove(&index) {
@@ -84,7 +84,7 @@ pub(crate) fn in_order<T: Send, E>(
             drop(state);
             let flow = consume(index, result);
             let mut state = shared.lock();
-            state.in_flight_bytes = state.in_flight_bytes.saturating_sub(costs[index]);
+            state.in_flight_bytes = state.in_flight_bytes.saturating_sub(cost);
             state.next_out = index + 1;
             drop(state);
             shared.changed.notify_all();
