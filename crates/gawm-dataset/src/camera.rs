@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use bytes::Bytes;
-use gawm_image::{PixelValues, Pixels, decode_pixels};
+use gawm_image::{Image, Limits, Pixels, decode};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -120,8 +120,8 @@ pub(crate) fn count_frames(
             .collect();
         let counted: Vec<CameraStats> = sampled
             .par_iter()
-            .filter_map(|frame| decode_pixels(frame).ok())
-            .map(|p| count_pixels(&p))
+            .filter_map(|frame| decode(frame, &Limits::default()).ok())
+            .map(|image| count_pixels(&image))
             .collect();
         let stats = cameras.entry(image.name.clone()).or_default();
         counted.iter().for_each(|one| stats.merge(one));
@@ -129,18 +129,20 @@ pub(crate) fn count_frames(
 }
 
 /// Counts every n-th pixel of every n-th row, so that at most about 256 x 256 pixels are looked at.
-fn count_pixels(pixels: &Pixels) -> CameraStats {
-    let step = (pixels.height.max(pixels.width) / 256).max(1);
-    let mut dense = vec![vec![0u64; 1 << 16]; pixels.channels.min(3)];
-    for y in (0..pixels.height).step_by(step) {
-        for x in (0..pixels.width).step_by(step) {
-            let start = (y * pixels.width + x) * pixels.channels;
+fn count_pixels(image: &Image) -> CameraStats {
+    let (height, width, channels) = (image.height() as usize, image.width() as usize, image.pixels().channels());
+    let step = (height.max(width) / 256).max(1);
+    let mut dense = vec![vec![0u64; 1 << 16]; channels.min(3)];
+    for y in (0..height).step_by(step) {
+        for x in (0..width).step_by(step) {
+            let start = (y * width + x) * channels;
             for (channel, counts) in dense.iter_mut().enumerate() {
-                let value = match &pixels.values {
-                    PixelValues::U8(values) => u16::from(values[start + channel]),
-                    PixelValues::U16(values) => values[start + channel],
+                let value = match image.pixels() {
+                    Pixels::Rgb8(values) | Pixels::Gray8(values) => u16::from(values[start + channel]),
+                    Pixels::Gray16(values) => values[start + channel],
                     // Metres as millimetres; NaN and negative values are 0: no measurement.
-                    PixelValues::F32(values) => (values[start + channel] * 1000.0).round() as u16,
+                    Pixels::GrayF32(values) => (values[start + channel] * 1000.0).round() as u16,
+                    _ => continue,
                 };
                 counts[usize::from(value)] += 1;
             }

@@ -45,6 +45,7 @@
 
 mod block;
 mod camera;
+pub mod cli;
 mod columns;
 mod data_file;
 mod durable;
@@ -54,14 +55,19 @@ mod error;
 mod image_header;
 mod journal;
 pub mod layout;
+mod picture;
 mod provenance;
+pub mod read;
+pub mod report;
 mod rows;
 mod scan;
 mod spec;
 mod statistics_file;
+pub mod stats;
 mod tables;
 mod totals;
 mod trajectory;
+pub mod validate;
 mod writer;
 
 pub use camera::{CameraStats, is_sampled};

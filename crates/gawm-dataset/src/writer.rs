@@ -153,6 +153,19 @@ impl DatasetWriter {
         Ok(())
     }
 
+    /// Replaces what is said of the open episode by what is known at its end; its id and task stay.
+    ///
+    /// # Errors
+    /// - no episode is open.
+    pub fn amend_episode(&mut self, info: EpisodeInfo) -> Result<(), WriteError> {
+        let recording = open_recording(&mut self.recording, "amend_episode")?;
+        let Some(episode) = recording.episode.as_mut() else {
+            return Err(order("amend_episode", "without an open episode"));
+        };
+        episode.amend(info);
+        Ok(())
+    }
+
     /// Appends rows to the open episode.
     ///
     /// # Errors

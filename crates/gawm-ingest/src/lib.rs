@@ -1,1 +1,14 @@
 //! Raw robot and simulator logs to datasets.
+#![forbid(unsafe_code)]
+
+pub mod align;
+pub mod cli;
+pub mod contract;
+pub mod decode;
+pub mod episodes;
+pub mod inspect;
+pub mod log;
+pub mod records;
+pub mod run;
+pub mod suggest;
+pub mod tabular;

@@ -78,6 +78,12 @@ impl OpenEpisode {
         }
     }
 
+    /// Takes what is known at the end; id and task stay.
+    pub(super) fn amend(&mut self, info: EpisodeInfo) {
+        let EpisodeInfo { id, task, .. } = std::mem::take(&mut self.info);
+        self.info = EpisodeInfo { id, task, ..info };
+    }
+
     pub(super) fn id(&self) -> &str {
         &self.info.id
     }

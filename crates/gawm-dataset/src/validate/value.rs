@@ -1,0 +1,575 @@
+//! Rules of group VALUE: each signal against itself in the other episodes.
+
+use std::f64::consts::TAU;
+
+use super::{
+    Finding, Severity, Thresholds,
+    group::GroupMeasure,
+    layout::{DimKind, Group, GroupKind, Purpose},
+    profile::{FeatureProfile, Plan, RunProfile},
+    robust::{centre_and_scale, median, quantile},
+    signal::{NOISE_ROWS, Signal},
+};
+
+/// Fewest runs whose comparison says something about one of them.
+const MIN_RUNS: usize = 4;
+/// Share of the largest range among dims of one unit below which a dim is at rest.
+const IDLE_SHARE: f64 = 0.05;
+/// Rows at the begin of an episode in which controllers settle: only large jumps count there.
+const SETTLING_ROWS: usize = 8;
+
+/// Share of runs in which a group of dims must keep its constraint to be recognised.
+const RECOGNISED_RUNS: f64 = 0.6;
+
+/// Judges all numbers of all runs.
+pub(super) fn judge(plan: &Plan, thresholds: &Thresholds, fps: f64, runs: &[RunProfile]) -> Vec<Finding> {
+    let mut findings = Vec::new();
+    for (feature, layout) in plan.layouts.iter().enumerate() {
+        let profiles: Vec<(&RunProfile, &FeatureProfile)> =
+            runs.iter().filter_map(|run| run.features[feature].as_ref().map(|p| (run, p))).collect();
+        if profiles.is_empty() {
+            continue;
+        }
+        let judge = Judge { plan, thresholds, fps, feature, profiles: &profiles };
+        let groups = judge.groups(&mut findings);
+        // Derived columns repeat what is said of the raw ones.
+        if layout.purpose == Purpose::Encoded {
+            continue;
+        }
+        for dim in 0..layout.width() {
+            let kind = groups
+                .iter()
+                .find(|g| (g.start..g.start + g.kind.width()).contains(&dim))
+                .map(|_| DimKind::Rotation);
+            judge.dim(dim, kind.unwrap_or(layout.kinds[dim]), &mut findings);
+        }
+        judge.equal_dims(&mut findings);
+        judge.scales(&mut findings);
+    }
+    findings
+}
+
+struct Judge<'a> {
+    plan: &'a Plan,
+    thresholds: &'a Thresholds,
+    fps: f64,
+    feature: usize,
+    profiles: &'a [(&'a RunProfile, &'a FeatureProfile)],
+}
+
+impl Judge<'_> {
+    fn finding(&self, code: &'static str, dim: usize, message: String) -> Finding {
+        let layout = &self.plan.layouts[self.feature];
+        Finding::new(code, message).feature(&layout.name).dim(&layout.names[dim])
+    }
+
+    fn signals(&self, dim: usize) -> impl Iterator<Item = (&RunProfile, &Signal)> {
+        self.profiles.iter().map(move |(run, profile)| (*run, &profile.dims[dim]))
+    }
+
+    /// Returns a robust typical value of a measure over the runs in which the dim moves.
+    fn typical(&self, dim: usize, measure: impl Fn(&Signal) -> f64) -> f64 {
+        let values: Vec<f64> =
+            self.signals(dim).filter(|(_, s)| !s.is_constant()).map(|(_, s)| measure(s)).collect();
+        median(&values)
+    }
+
+    /// Returns whether the dim hardly moves beside others of its unit: what it shows is the noise of a joint at rest.
+    fn is_idle(&self, dim: usize) -> bool {
+        let layout = &self.plan.layouts[self.feature];
+        let peers = (0..layout.width()).filter(|d| layout.units[*d] == layout.units[dim]);
+        let largest =
+            peers.map(|d| self.typical(d, Signal::range)).filter(|r| r.is_finite()).fold(0.0, f64::max);
+        self.typical(dim, Signal::range) < IDLE_SHARE * largest
+    }
+
+    fn dim(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
+        let moving = self.signals(dim).filter(|(_, s)| s.n_finite > 1 && !s.is_constant()).count();
+        if moving == 0 {
+            self.constant_everywhere(dim, findings);
+        } else {
+            self.constant_here(dim, moving, findings);
+            self.stuck(dim, kind, findings);
+            self.saturated(dim, kind, findings);
+            if !self.is_idle(dim) {
+                self.jumps(dim, kind, findings);
+                self.noise(dim, kind, findings);
+            }
+            self.wraps(dim, kind, findings);
+            self.offset(dim, kind, findings);
+        }
+        self.degrees(dim, findings);
+        self.limits(dim, findings);
+        if kind == DimKind::Bool {
+            for (run, signal) in self.signals(dim).filter(|(_, s)| s.n_not_bool > 0) {
+                let message = format!(
+                    "{} values are neither 0 nor 1, between {} and {}",
+                    signal.n_not_bool, signal.min, signal.max
+                );
+                findings.push(
+                    self.finding("VALUE-014", dim, message)
+                        .episode(run.episode)
+                        .measured(signal.n_not_bool as f64, 0.0),
+                );
+            }
+        }
+    }
+
+    fn constant_everywhere(&self, dim: usize, findings: &mut Vec<Finding>) {
+        let levels: Vec<f64> =
+            self.signals(dim).filter(|(_, s)| s.n_finite > 0).map(|(_, s)| s.min).collect();
+        let Some(first) = levels.first() else { return };
+        if levels.iter().all(|l| l == first) {
+            let is_target = self.plan.layouts[self.feature].purpose == Purpose::Action;
+            let what = if is_target { "the action" } else { "the value" };
+            findings.push(self.finding(
+                "VALUE-002",
+                dim,
+                format!("{what} is {first} in every row of the dataset"),
+            ));
+        }
+    }
+
+    fn constant_here(&self, dim: usize, moving: usize, findings: &mut Vec<Finding>) {
+        let n_runs = self.profiles.len();
+        if n_runs < 3 || (moving as f64) < 0.65 * n_runs as f64 {
+            return;
+        }
+        // A joint that hardly moves elsewhere may rest for one episode.
+        let rest = self.typical(dim, |s| s.rest_share);
+        if rest > 0.5 {
+            return;
+        }
+        for (run, signal) in self.signals(dim).filter(|(run, s)| s.is_constant() && run.n_rows >= 10) {
+            let message = format!(
+                "the value is {} in all {} rows; it moves in {moving} of {n_runs} episodes",
+                signal.min, run.n_rows
+            );
+            findings
+                .push(self.finding("SEMANTIC-004", dim, message).episode(run.episode).rows(0, run.n_rows));
+        }
+    }
+
+    fn stuck(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
+        let bounds = &self.thresholds.value;
+        if matches!(kind, DimKind::Bool | DimKind::Gripper) {
+            return;
+        }
+        let shortest = (bounds.stuck_secs * self.fps).max(bounds.stuck_rows);
+        let rests: Vec<f64> = self
+            .signals(dim)
+            .filter(|(_, s)| !s.is_constant())
+            .map(|(_, s)| s.longest_rest.n_rows as f64)
+            .collect();
+        let pair = self.plan.pairs.iter().position(|(_, s)| self.plan.states[*s] == (self.feature, dim));
+        for (run, profile) in self.profiles {
+            let signal = &profile.dims[dim];
+            let rest = signal.longest_rest;
+            if signal.is_constant() || (rest.n_rows as f64) < shortest {
+                continue;
+            }
+            let elsewhere = if rests.len() >= 3 { quantile(&rests, 0.5) } else { 0.0 };
+            let usual = elsewhere.max(signal.second_rest as f64);
+            let others_move = profile.rest_motion[dim] > 0.3;
+            let is_driven = pair.is_some_and(|p| run.rest_drive[p] > 0.1);
+            let outside =
+                1.0 - (1.0 - signal.rest_share) * run.n_rows as f64 / (run.n_rows - rest.n_rows + 1) as f64;
+            let is_unusual = rest.n_rows as f64 > bounds.stuck_ratio * usual && outside < 0.5;
+            let is_single = self.plan.layouts[self.feature].width() == 1;
+            if is_unusual && (others_move || is_driven || is_single) {
+                let mut message = format!(
+                    "the value stays exactly {:.6} for {} rows; it usually rests for {usual:.0}",
+                    self.level(run, dim),
+                    rest.n_rows
+                );
+                message += if is_driven {
+                    ", and its action moves meanwhile"
+                } else {
+                    ", and the other dims move meanwhile"
+                };
+                let finding =
+                    self.finding("VALUE-003", dim, message).episode(run.episode).rows(rest.start, rest.end());
+                findings.push(finding.measured(rest.n_rows as f64, bounds.stuck_ratio * usual));
+            }
+        }
+    }
+
+    fn level(&self, run: &RunProfile, dim: usize) -> f64 {
+        run.features[self.feature].as_ref().map_or(f64::NAN, |p| p.dims[dim].median)
+    }
+
+    fn saturated(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
+        let bounds = &self.thresholds.value;
+        if matches!(kind, DimKind::Bool | DimKind::Gripper | DimKind::Rotation) {
+            return;
+        }
+        let is_action = self.plan.layouts[self.feature].purpose == Purpose::Action;
+        let bound = if is_action { bounds.saturated_action_share } else { bounds.saturated_share };
+        for (run, signal) in self.signals(dim) {
+            let Some(clipped) = signal.clipped else { continue };
+            let share = clipped.n_rows as f64 / run.n_rows as f64;
+            if share >= bounds.saturated_share && (clipped.n_plateaus >= 2 || clipped.n_rows >= 5) {
+                let message = format!(
+                    "the value is cut off at {:.6} in {} rows ({:.1} %), {} plateaus reached at speed",
+                    clipped.level,
+                    clipped.n_rows,
+                    100.0 * share,
+                    clipped.n_plateaus
+                );
+                let finding = self
+                    .finding("VALUE-004", dim, message)
+                    .episode(run.episode)
+                    .rows(clipped.first.start, clipped.first.end());
+                let finding = if share >= bound { finding } else { finding.at(Severity::Info) };
+                findings.push(finding.measured(share, bound));
+            }
+        }
+    }
+
+    fn jumps(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
+        let bounds = &self.thresholds.value;
+        let rest = self.typical(dim, |s| s.rest_share);
+        if matches!(kind, DimKind::Bool | DimKind::Gripper) || rest > 0.9 {
+            return;
+        }
+        let usual = self.typical(dim, |s| s.rough99);
+        let range = self.typical(dim, Signal::range);
+        let floor = (bounds.jump_ratio * usual).max(bounds.jump_range_share * range);
+        if usual <= 0.0 || floor <= 0.0 {
+            return;
+        }
+        let n_rows: usize = self.profiles.iter().map(|(run, _)| run.n_rows).sum();
+        let counts: Vec<usize> =
+            self.signals(dim).map(|(_, s)| s.jumps.iter().filter(|j| j.size > floor).count()).collect();
+        let n_jumping = counts.iter().filter(|c| **c > 0).count();
+        // A signal that jumps everywhere is made of steps: set points, not measurements.
+        let is_stepping = counts.iter().sum::<usize>() as f64 > 0.005 * n_rows as f64
+            || (counts.len() >= MIN_RUNS
+                && n_jumping * 2 > counts.len()
+                && counts.iter().sum::<usize>() > 3 * counts.len());
+        if is_stepping {
+            return;
+        }
+        for (run, signal) in self.signals(dim) {
+            if kind == DimKind::Rotation && self.has_flips(run, dim) {
+                continue;
+            }
+            let mut jumps: Vec<_> = signal
+                .jumps
+                .iter()
+                .filter(|j| j.size > floor && !signal.zero_drops.contains(&j.row))
+                .filter(|j| j.row > SETTLING_ROWS || j.size > 0.5 * range)
+                .collect();
+            jumps.sort_by_key(|j| j.row);
+            let Some(first) = jumps.first() else { continue };
+            let worst = jumps.iter().map(|j| j.size).fold(0.0, f64::max);
+            let message = format!(
+                "{} jumps of up to {worst:.6}, {:.0} times the usual unsteadiness",
+                jumps.len(),
+                worst / usual
+            );
+            let finding =
+                self.finding("VALUE-005", dim, message).episode(run.episode).rows(first.row, first.row + 1);
+            findings.push(finding.measured(worst / usual, floor / usual));
+        }
+        for (run, signal) in self.signals(dim) {
+            if let Some(first) = signal.zero_drops.first() {
+                let message = format!(
+                    "the value is exactly 0 in {} single places between values near {:.4}",
+                    signal.zero_drops.len(),
+                    signal.median
+                );
+                let finding =
+                    self.finding("VALUE-018", dim, message).episode(run.episode).rows(*first, first + 1);
+                findings.push(finding.measured(signal.zero_drops.len() as f64, 0.0));
+            }
+        }
+    }
+
+    fn has_flips(&self, run: &RunProfile, dim: usize) -> bool {
+        let profile = run.features[self.feature].as_ref();
+        let holds = |g: &&GroupMeasure| (g.group.start..g.group.start + g.group.kind.width()).contains(&dim);
+        profile.is_some_and(|p| p.groups.iter().filter(holds).any(|g| g.n_flips > 0))
+    }
+
+    fn noise(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
+        let bounds = &self.thresholds.value;
+        if matches!(kind, DimKind::Bool | DimKind::Gripper) || self.typical(dim, |s| s.rest_share) > 0.5 {
+            return;
+        }
+        let usual = self.typical(dim, |s| s.noise90);
+        let step = self.typical(dim, |s| s.step);
+        for (run, signal) in self.signals(dim).filter(|(_, s)| !s.is_constant()) {
+            let Some((window, level)) = signal.noisiest else { continue };
+            if level > bounds.noise_ratio * usual && level > step && usual > 0.0 {
+                let message = format!(
+                    "{NOISE_ROWS} rows are {:.0} times noisier than the noisiest tenth elsewhere",
+                    level / usual
+                );
+                let finding = self
+                    .finding("VALUE-015", dim, message)
+                    .episode(run.episode)
+                    .rows(window.start, window.end());
+                findings.push(finding.measured(level / usual, bounds.noise_ratio));
+            }
+        }
+    }
+
+    fn wraps(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
+        if matches!(kind, DimKind::Wrapped { .. } | DimKind::Rotation | DimKind::Bool | DimKind::Gripper)
+            || self.typical(dim, |s| s.rest_share) > 0.9
+        {
+            return;
+        }
+        for (run, signal) in self.signals(dim) {
+            let Some(first) = signal.first_wrap else { continue };
+            let message = format!("the value wraps by {:.4} in {} rows", signal.wrap_period, signal.n_wraps);
+            let finding = self.finding("VALUE-007", dim, message).episode(run.episode).rows(first, first + 1);
+            findings.push(finding.measured(signal.n_wraps as f64, 0.0));
+        }
+    }
+
+    fn degrees(&self, dim: usize, findings: &mut Vec<Finding>) {
+        let layout = &self.plan.layouts[self.feature];
+        if !layout.is_radian(dim) {
+            return;
+        }
+        for (run, signal) in self.signals(dim) {
+            // A wheel turns one way without end; a joint in degrees goes back and forth.
+            let is_wheel = signal.one_way > 0.8 && signal.range() > 2.0 * TAU && signal.step < 0.5;
+            if signal.share_beyond_tau >= self.thresholds.value.degrees_share && !is_wheel {
+                let share = 100.0 * signal.share_beyond_tau;
+                let message = format!(
+                    "{share:.0} % of the values lie beyond 2 pi, up to {:.2}, under the label radian",
+                    signal.max.abs().max(signal.min.abs())
+                );
+                let finding =
+                    self.finding("VALUE-006", dim, message).episode(run.episode).rows(0, run.n_rows);
+                findings.push(finding.measured(signal.share_beyond_tau, self.thresholds.value.degrees_share));
+            }
+        }
+    }
+
+    fn limits(&self, dim: usize, findings: &mut Vec<Finding>) {
+        let Some([low, high]) = self.plan.layouts[self.feature].limits[dim] else { return };
+        let slack = self.thresholds.value.limit_slack * (high - low);
+        for (run, signal) in self.signals(dim).filter(|(_, s)| s.n_finite > 0) {
+            let beyond = (low - signal.min).max(signal.max - high);
+            if beyond > slack {
+                let message = format!(
+                    "values between {:.4} and {:.4}, limits are {low:.4} and {high:.4}",
+                    signal.min, signal.max
+                );
+                findings.push(
+                    self.finding("VALUE-012", dim, message).episode(run.episode).measured(beyond, slack),
+                );
+            }
+        }
+    }
+
+    fn offset(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
+        let bounds = &self.thresholds.value;
+        if matches!(kind, DimKind::Rotation | DimKind::Bool) || self.profiles.len() < 6 {
+            return;
+        }
+        let centres: Vec<f64> = self.signals(dim).map(|(_, s)| s.median).collect();
+        let (centre, scale) = centre_and_scale(&centres);
+        let range = self.typical(dim, Signal::range);
+        for (run, signal) in self.signals(dim).filter(|(_, s)| s.n_finite > 0) {
+            let distance = (signal.median - centre).abs();
+            if distance > bounds.offset_sigmas * scale
+                && distance > 1.5 * range
+                && signal.range() > 0.2 * range
+            {
+                let message =
+                    format!("the median is {:.4}, in the other episodes about {centre:.4}", signal.median);
+                let finding = self.finding("VALUE-016", dim, message).episode(run.episode);
+                findings.push(finding.measured(distance / scale.max(1e-12), bounds.offset_sigmas));
+            }
+        }
+    }
+
+    fn equal_dims(&self, findings: &mut Vec<Finding>) {
+        let Some((_, first)) = self.profiles.first() else { return };
+        for (a, b) in &first.equal_dims {
+            let is_always = self.profiles.iter().all(|(_, p)| {
+                p.equal_dims.contains(&(*a, *b))
+                    || (p.dims[*a].is_constant()
+                        && p.dims[*a].min == p.dims[*b].min
+                        && p.dims[*b].is_constant())
+            });
+            if is_always {
+                let layout = &self.plan.layouts[self.feature];
+                let message =
+                    format!("dims {:?} and {:?} are equal in every row", layout.names[*a], layout.names[*b]);
+                findings.push(self.finding("VALUE-017", *b, message));
+            }
+        }
+        // Equal in one episode only: a channel was written twice.
+        for (run, profile) in self.profiles {
+            for (a, b) in profile.equal_dims.iter().filter(|pair| {
+                self.profiles.len() >= MIN_RUNS && self.equal_runs(**pair) * 4 < self.profiles.len()
+            }) {
+                let layout = &self.plan.layouts[self.feature];
+                let message = format!(
+                    "dims {:?} and {:?} are equal in every row of this episode only",
+                    layout.names[*a], layout.names[*b]
+                );
+                findings
+                    .push(self.finding("VALUE-017", *b, message).episode(run.episode).at(Severity::Warning));
+            }
+        }
+    }
+
+    fn equal_runs(&self, pair: (usize, usize)) -> usize {
+        self.profiles.iter().filter(|(_, p)| p.equal_dims.contains(&pair)).count()
+    }
+
+    /// Compares the scale of each run with the others: all dims together, or one dim by a known factor.
+    fn scales(&self, findings: &mut Vec<Finding>) {
+        let layout = &self.plan.layouts[self.feature];
+        if self.profiles.len() < MIN_RUNS || layout.purpose == Purpose::Other && layout.width() == 1 {
+            return;
+        }
+        let usual: Vec<(f64, f64)> = (0..layout.width())
+            .map(|d| (self.typical(d, |s| s.step), self.typical(d, |s| s.min.abs().max(s.max.abs()))))
+            .collect();
+        for (run, profile) in self.profiles {
+            let ratio_of = |d: usize| {
+                let signal = &profile.dims[d];
+                let (step, level) = usual[d];
+                let is_usable =
+                    !signal.is_constant() && step > 0.0 && level > 0.0 && layout.kinds[d] != DimKind::Bool;
+                is_usable.then(|| (signal.step / step, signal.min.abs().max(signal.max.abs()) / level))
+            };
+            let ratios: Vec<(usize, f64, f64)> =
+                (0..layout.width()).filter_map(|d| ratio_of(d).map(|(s, l)| (d, s, l))).collect();
+            let both: Vec<f64> = ratios.iter().map(|(_, s, l)| s.min(*l)).collect();
+            let small: Vec<f64> = ratios.iter().map(|(_, s, l)| s.max(*l)).collect();
+            let bound = self.thresholds.value.scale_ratio;
+            let (large, small) = (median(&both), median(&small));
+            if large > bound || (small < 1.0 / bound && small > 0.0) {
+                let ratio = if large > bound { large } else { small };
+                let message = format!(
+                    "values and steps are {ratio:.3} times those of the other episodes{}",
+                    known_factor(ratio)
+                );
+                findings.push(
+                    Finding::new("VALUE-013", message)
+                        .feature(&layout.name)
+                        .episode(run.episode)
+                        .measured(ratio, bound),
+                );
+                continue;
+            }
+            for (d, step, level) in ratios {
+                let is_known = |r: f64| !known_factor(r).is_empty();
+                let ratio = (step * level).abs().sqrt();
+                if is_known(ratio) && (step / level).ln().abs() < 0.9 {
+                    let message = format!(
+                        "values and steps are {ratio:.3} times those of the other episodes{}",
+                        known_factor(ratio)
+                    );
+                    findings.push(
+                        self.finding("VALUE-013", d, message).episode(run.episode).measured(ratio, bound),
+                    );
+                }
+            }
+        }
+    }
+
+    /// Judges rotations and circle points; returns the groups, declared or recognised.
+    fn groups(&self, findings: &mut Vec<Finding>) -> Vec<Group> {
+        let layout = &self.plan.layouts[self.feature];
+        let mut groups: Vec<Group> = layout.groups.clone();
+        let mut candidates: Vec<(Group, f64)> = Vec::new();
+        for measure in self.profiles.iter().flat_map(|(_, p)| &p.groups) {
+            if !groups.contains(&measure.group) && !candidates.iter().any(|(g, _)| *g == measure.group) {
+                candidates.push((measure.group, self.kept_runs(measure.group)));
+            }
+        }
+        candidates.retain(|(_, share)| *share >= RECOGNISED_RUNS);
+        // Wider groups first: a quaternion about one axis contains a point on the circle.
+        candidates.sort_by(|a, b| {
+            b.0.kind.width().cmp(&a.0.kind.width()).then(b.1.total_cmp(&a.1)).then(a.0.start.cmp(&b.0.start))
+        });
+        for (group, _) in candidates {
+            if groups.iter().all(|g| {
+                g.start + g.kind.width() <= group.start || group.start + group.kind.width() <= g.start
+            }) {
+                groups.push(group);
+            }
+        }
+        for group in &groups {
+            self.judge_group(*group, layout.groups.contains(group), findings);
+        }
+        groups
+    }
+
+    /// Returns the share of runs in which nearly all rows keep the constraint of `group` while it moves.
+    fn kept_runs(&self, group: Group) -> f64 {
+        let kept = self.measures(group).filter(|(_, m)| m.kept_share > 0.9 && m.is_moving).count();
+        kept as f64 / self.profiles.len() as f64
+    }
+
+    fn measures(&self, group: Group) -> impl Iterator<Item = (&RunProfile, &GroupMeasure)> {
+        self.profiles
+            .iter()
+            .filter_map(move |(run, p)| p.groups.iter().find(|m| m.group == group).map(|m| (*run, m)))
+    }
+
+    fn judge_group(&self, group: Group, is_declared: bool, findings: &mut Vec<Finding>) {
+        let (code, what, mut tolerance) = match group.kind {
+            GroupKind::Quaternion => {
+                ("VALUE-008", "the norm of the quaternion", self.thresholds.value.quaternion_norm)
+            }
+            GroupKind::SinCos => ("VALUE-010", "sin^2 + cos^2", self.thresholds.value.circle),
+            GroupKind::SixD => ("VALUE-011", "the 6-D rotation", self.thresholds.value.orthonormal),
+            GroupKind::Matrix => ("VALUE-011", "the rotation matrix", self.thresholds.value.orthonormal),
+        };
+        if !is_declared {
+            // A recognised group is judged by how well it is kept elsewhere.
+            let usual: Vec<f64> = self.measures(group).map(|(_, m)| m.high).collect();
+            tolerance = tolerance.max(5.0 * median(&usual));
+        }
+        for (run, measure) in self.measures(group) {
+            let worst = if is_declared || measure.kept_share >= 0.3 { measure.worst } else { measure.median };
+            if worst > tolerance {
+                let message = format!(
+                    "{what} in dims {} to {} is off by up to {worst:.4}",
+                    group.start,
+                    group.start + group.kind.width() - 1
+                );
+                let finding = self.finding(code, group.start, message).episode(run.episode);
+                let finding = finding.rows(measure.stretch.start, measure.stretch.end());
+                findings.push(finding.measured(worst, tolerance));
+            }
+            if measure.n_flips > 0 {
+                let message = format!(
+                    "the quaternion in dims {} to {} flips its sign {} times",
+                    group.start,
+                    group.start + 3,
+                    measure.n_flips
+                );
+                let finding = self.finding("VALUE-009", group.start, message).episode(run.episode);
+                findings.push(
+                    finding
+                        .rows(measure.first_flip, measure.first_flip + 1)
+                        .measured(measure.n_flips as f64, 0.0),
+                );
+            }
+        }
+    }
+}
+
+/// Names a factor between units that are often confused.
+pub(super) fn known_factor(ratio: f64) -> &'static str {
+    let near = |factor: f64| (ratio / factor).ln().abs() < 0.25;
+    match () {
+        () if near(360.0 / TAU) => " (degrees for radians)",
+        () if near(TAU / 360.0) => " (radians for degrees)",
+        () if near(1000.0) => " (mm for m)",
+        () if near(0.001) => " (m for mm)",
+        () => "",
+    }
+}

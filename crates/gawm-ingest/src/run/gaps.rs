@@ -1,0 +1,53 @@
+//! Gaps in words.
+
+use super::RunError;
+use super::bind::Binding;
+use crate::align::{GapAction, GapEvent, Stop};
+
+/// Gaps that are described one by one.
+const LISTED: usize = 20;
+
+/// Returns one line per gap; times are seconds after the start of the log.
+pub(crate) fn describe(binding: &Binding, gaps: &[GapEvent], start_ns: i64) -> Vec<String> {
+    let mut lines: Vec<String> = gaps.iter().take(LISTED).map(|gap| line(binding, gap, start_ns)).collect();
+    if gaps.len() > LISTED {
+        lines.push(format!("{} more gaps, not listed", gaps.len() - LISTED));
+    }
+    lines
+}
+
+fn line(binding: &Binding, gap: &GapEvent, start_ns: i64) -> String {
+    let seconds = |ns: i64| ns.saturating_sub(start_ns) as f64 / 1e9;
+    let who = match gap.stream {
+        Some(stream) => format!("stream {:?} ({})", binding.streams[stream].name, binding.streams[stream].topic),
+        None => "all streams".to_owned(),
+    };
+    let rule = match gap.rule {
+        GapAction::Split => "the episode is split",
+        GapAction::Mask => "rows are masked",
+        GapAction::DropEpisode => "the episode is left out",
+        GapAction::Fail => "the run fails",
+    };
+    match (gap.last_ns, gap.resumed_ns) {
+        (Some(last), Some(resumed)) => format!(
+            "{who}: gap of {:.1} ms from {:.3} s to {:.3} s; {rule}",
+            resumed.saturating_sub(last) as f64 / 1e6,
+            seconds(last),
+            seconds(resumed)
+        ),
+        (Some(last), None) => format!("{who}: silent from {:.3} s on; {rule}", seconds(last)),
+        (None, Some(resumed)) => format!("{who}: no sample before {:.3} s; {rule}", seconds(resumed)),
+        (None, None) => format!("{who}: no usable sample; {rule}"),
+    }
+}
+
+pub(crate) fn stop_error(binding: &Binding, log: &str, stop: Stop) -> RunError {
+    let stream = &binding.streams[stop.stream];
+    RunError::Gap {
+        log: log.to_owned(),
+        stream: stream.name.clone(),
+        topic: stream.topic.clone(),
+        tick_ns: stop.tick_ns,
+        age_ms: stop.last_ns.map_or(f64::NAN, |last| stop.tick_ns.saturating_sub(last) as f64 / 1e6),
+    }
+}

@@ -1,0 +1,260 @@
+//! What is decoded of each message: compiled once per channel, shared by all threads.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use super::bind::{BoundStream, Binding};
+use crate::contract::{Clock, StreamData};
+use crate::decode::{
+    ChannelSchema, CompileError, DecodeError, DecodePlan, Decoded, FieldPath, ImagePlan, RowSink, SchemaLibrary,
+    Segment, StampSource, StampUnit, Value,
+};
+use crate::log::Channel;
+
+/// Returns what decoding needs to know of a channel.
+pub(crate) fn schema_of(channel: &Channel) -> ChannelSchema<'_> {
+    let schema = channel.schema.as_deref();
+    ChannelSchema {
+        topic: &channel.topic,
+        message_encoding: &channel.message_encoding,
+        schema_name: schema.map_or("", |schema| &schema.name),
+        schema_encoding: schema.map_or("", |schema| &schema.encoding),
+        schema_data: schema.map_or(&[], |schema| &schema.data),
+    }
+}
+
+/// Decodes the values of a group of streams.
+#[derive(Debug)]
+pub(crate) enum VectorDecoder {
+    /// The message itself holds them.
+    Direct(DecodePlan),
+    /// A text of the message holds them as JSON, as `std_msgs/String` often does.
+    Text {
+        /// Takes the text.
+        text: DecodePlan,
+        /// Decodes it.
+        inner: DecodePlan,
+        /// Where the text is.
+        prefix: String,
+    },
+}
+
+/// The sinks that a decoder needs; one per thread.
+#[derive(Debug, Default)]
+pub(crate) struct Sinks {
+    pub(crate) rows: RowSink,
+    text: RowSink,
+}
+
+/// Compiles a decoder for paths; those that go on below a text are looked for in the JSON that it holds.
+pub(crate) fn compile_vector(
+    channel: &ChannelSchema<'_>,
+    fields: &[FieldPath],
+    clock: &Clock,
+    library: &SchemaLibrary,
+) -> Result<VectorDecoder, CompileError> {
+    let stamp = match clock {
+        Clock::Stamp => StampSource::Auto,
+        Clock::Publish | Clock::Log => StampSource::None,
+        Clock::Field(path) => StampSource::Path { path: path.parse()?, unit: StampUnit::Auto },
+    };
+    match DecodePlan::compile_with(channel, fields, &stamp, library) {
+        Ok(plan) => Ok(VectorDecoder::Direct(plan)),
+        Err(error) => compile_text(channel, fields, &stamp, library).unwrap_or(Err(error)),
+    }
+}
+
+fn compile_text(
+    channel: &ChannelSchema<'_>,
+    fields: &[FieldPath],
+    stamp: &StampSource,
+    library: &SchemaLibrary,
+) -> Option<Result<VectorDecoder, CompileError>> {
+    let Segment::Field(first) = fields.first()?.segments().first()? else { return None };
+    let prefix = FieldPath::from_members([first.clone()]);
+    let text = DecodePlan::compile_with(channel, &[prefix], &StampSource::None, library).ok()?;
+    if text.columns().first()?.scalar != crate::decode::Scalar::Text {
+        return None;
+    }
+    let rest: Option<Vec<FieldPath>> = fields
+        .iter()
+        .map(|path| path.to_string().strip_prefix(&format!("{first}."))?.parse::<FieldPath>().ok())
+        .collect();
+    let json = ChannelSchema { topic: channel.topic, message_encoding: "json", ..ChannelSchema::default() };
+    let stamp = match stamp {
+        StampSource::Path { path, unit } => StampSource::Path {
+            path: path.to_string().strip_prefix(&format!("{first}."))?.parse().ok()?,
+            unit: *unit,
+        },
+        other => other.clone(),
+    };
+    let inner = DecodePlan::compile_with(&json, &rest?, &stamp, library);
+    Some(inner.map(|inner| VectorDecoder::Text { text, inner, prefix: first.clone() }))
+}
+
+impl VectorDecoder {
+    /// Returns the path of each value.
+    pub(crate) fn columns(&self) -> Vec<String> {
+        let (plan, prefix) = match self {
+            VectorDecoder::Direct(plan) => (plan, String::new()),
+            VectorDecoder::Text { inner, prefix, .. } => (inner, format!("{prefix}.")),
+        };
+        plan.columns().iter().map(|column| format!("{prefix}{}", column.path)).collect()
+    }
+
+    /// Appends the values of a message to `sinks.rows`.
+    pub(crate) fn decode(&self, payload: &[u8], sinks: &mut Sinks) -> Result<Decoded, DecodeError> {
+        match self {
+            VectorDecoder::Direct(plan) => plan.decode(payload, &mut sinks.rows),
+            VectorDecoder::Text { text, inner, .. } => {
+                let (_, values) = text.decode_values(payload, &mut sinks.text)?;
+                let text = values.first().and_then(Value::as_text).unwrap_or_default();
+                inner.decode(text.as_bytes(), &mut sinks.rows)
+            }
+        }
+    }
+}
+
+/// What is wanted of a topic.
+#[derive(Debug, Default)]
+pub(crate) struct MappedTopic {
+    /// Its name.
+    pub(crate) topic: String,
+    /// Groups of values with one stamp each.
+    pub(crate) groups: Vec<Group>,
+    /// Streams of images.
+    pub(crate) images: Vec<usize>,
+    /// Whether whole messages are wanted, for markers and labels.
+    pub(crate) is_event: bool,
+    /// Whether it holds calibrations.
+    pub(crate) is_camera_info: bool,
+}
+
+/// Streams of a topic whose samples have the same stamp.
+#[derive(Debug)]
+pub(crate) struct Group {
+    clock: Clock,
+    fields: Vec<FieldPath>,
+    /// Streams and where their values lie in the row.
+    pub(crate) streams: Vec<(usize, Range<usize>)>,
+    width: usize,
+}
+
+/// The topics of a binding, and their plans per channel.
+#[derive(Debug)]
+pub(crate) struct Plans {
+    /// By topic.
+    pub(crate) topics: Vec<MappedTopic>,
+    index: BTreeMap<String, usize>,
+    library: SchemaLibrary,
+    compiled: Mutex<Vec<(Arc<Channel>, Arc<ChannelPlan>)>>,
+}
+
+/// How the messages of one channel are decoded.
+#[derive(Debug)]
+pub(crate) struct ChannelPlan {
+    /// Index of the topic; none when it is not mapped.
+    pub(crate) topic: Option<usize>,
+    /// One decoder per group.
+    pub(crate) vectors: Vec<VectorDecoder>,
+    /// Takes images out.
+    pub(crate) image: Option<ImagePlan>,
+    /// Why the channel cannot be decoded.
+    pub(crate) error: Option<CompileError>,
+}
+
+impl Plans {
+    /// Collects what a binding wants; `events` and `infos` are topics of markers and labels, and of calibrations.
+    pub(crate) fn new(binding: &Binding, events: &[String], infos: &[String], library: &SchemaLibrary) -> Plans {
+        let mut topics: Vec<MappedTopic> = Vec::new();
+        let mut index = BTreeMap::new();
+        let mut at = |name: &str, topics: &mut Vec<MappedTopic>| -> usize {
+            *index.entry(name.to_owned()).or_insert_with(|| {
+                topics.push(MappedTopic { topic: name.to_owned(), ..MappedTopic::default() });
+                topics.len() - 1
+            })
+        };
+        for (stream, bound) in binding.streams.iter().enumerate() {
+            let topic = at(&bound.topic, &mut topics);
+            match &bound.rule.data {
+                StreamData::Vector(_) => topics[topic].add(stream, bound),
+                _ => topics[topic].images.push(stream),
+            }
+        }
+        for name in events {
+            let topic = at(name, &mut topics);
+            topics[topic].is_event = true;
+        }
+        for name in infos {
+            let topic = at(name, &mut topics);
+            topics[topic].is_camera_info = true;
+        }
+        Plans { topics, index, library: library.clone(), compiled: Mutex::default() }
+    }
+
+    pub(crate) fn library(&self) -> &SchemaLibrary {
+        &self.library
+    }
+
+    /// Returns the plan of a channel, compiled when it is met first.
+    pub(crate) fn of(&self, channel: &Arc<Channel>) -> Arc<ChannelPlan> {
+        let mut compiled = self.compiled.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = compiled.iter().find(|(known, _)| Arc::ptr_eq(known, channel) || **known == **channel);
+        if let Some((_, plan)) = known {
+            return Arc::clone(plan);
+        }
+        let plan = Arc::new(self.compile(channel));
+        compiled.push((Arc::clone(channel), Arc::clone(&plan)));
+        plan
+    }
+
+    fn compile(&self, channel: &Channel) -> ChannelPlan {
+        let topic = self.index.get(&channel.topic).copied();
+        let mut plan = ChannelPlan { topic, vectors: Vec::new(), image: None, error: None };
+        let Some(mapped) = topic.map(|topic| &self.topics[topic]) else { return plan };
+        let schema = schema_of(channel);
+        for group in &mapped.groups {
+            match compile_vector(&schema, &group.fields, &group.clock, &self.library) {
+                Ok(decoder) if decoder.columns().len() == group.width => plan.vectors.push(decoder),
+                Ok(decoder) => {
+                    let got = decoder.columns().len();
+                    plan.error = Some(CompileError::WrongShape {
+                        topic: channel.topic.clone(),
+                        path: group.fields.first().map(ToString::to_string).unwrap_or_default(),
+                        expected: format!("{} values as in the first channel of this topic", group.width),
+                        got: format!("{got} values"),
+                    });
+                }
+                Err(error) => plan.error = Some(error),
+            }
+        }
+        if !mapped.images.is_empty() {
+            match ImagePlan::compile(&schema, &self.library) {
+                Ok(image) => plan.image = Some(image),
+                Err(error) => plan.error = Some(error),
+            }
+        }
+        plan
+    }
+}
+
+impl MappedTopic {
+    fn add(&mut self, stream: usize, bound: &BoundStream) {
+        // Log and publish times need no stamp, so such streams share the group of those that do.
+        let clock = match &bound.rule.clock {
+            Clock::Field(path) => Clock::Field(path.clone()),
+            _ => Clock::Stamp,
+        };
+        let at = self.groups.iter().position(|group| group.clock == clock);
+        let at = at.unwrap_or_else(|| {
+            self.groups.push(Group { clock, fields: Vec::new(), streams: Vec::new(), width: 0 });
+            self.groups.len() - 1
+        });
+        let group = &mut self.groups[at];
+        let range = group.width..group.width + bound.columns.len();
+        group.width = range.end;
+        group.fields.extend(bound.fields.iter().cloned());
+        group.streams.push((stream, range));
+    }
+}

@@ -1,0 +1,110 @@
+//! Looks into a recording for what the schema needs: sizes of images, rate of reference ticks.
+
+use std::collections::BTreeMap;
+use std::ops::ControlFlow;
+
+use gawm_schema::ImageSpec;
+
+use super::RunError;
+use super::bind::Binding;
+use super::plan::Plans;
+use super::recording::OpenRecording;
+use crate::contract::{CheckedContract, Clock, ContractError, StreamData, TickRule};
+use crate::decode::SchemaLibrary;
+
+/// Samples of the reference stream that its rate is measured from.
+const RATE_SAMPLES: usize = 400;
+
+/// What was found.
+pub(crate) struct Probed {
+    pub(crate) rate_hz: f64,
+    pub(crate) sizes: BTreeMap<usize, ImageSpec>,
+    /// Image streams without a single image.
+    pub(crate) without_size: Vec<usize>,
+    /// Messages of image topics that were looked at.
+    pub(crate) read: u64,
+    pub(crate) first_loss: Option<String>,
+}
+
+/// Reads as many blocks as are needed.
+pub(crate) fn probe(
+    open: &OpenRecording,
+    binding: &Binding,
+    contract: &CheckedContract,
+    library: &SchemaLibrary,
+) -> Result<Probed, RunError> {
+    let reference = match &contract.ticks {
+        TickRule::Fixed { .. } => None,
+        TickRule::Reference { stream } => binding.streams.iter().position(|bound| bound.name == *stream),
+    };
+    let rate_hz = match (&contract.ticks, contract.written.ticks.fps) {
+        (TickRule::Fixed { rate_hz }, _) => Some(*rate_hz),
+        (TickRule::Reference { .. }, _) => None,
+    };
+    let images: Vec<usize> = (0..binding.streams.len())
+        .filter(|&stream| matches!(binding.streams[stream].rule.data, StreamData::Image(_)))
+        .collect();
+    let mut probed =
+        Probed { rate_hz: rate_hz.unwrap_or(0.0), sizes: BTreeMap::new(), without_size: Vec::new(), read: 0, first_loss: None };
+    let plans = Plans::new(binding, &[], &[], library);
+    let mut times: Vec<i64> = Vec::new();
+    // Broken off or not, what was found is found.
+    let _: ControlFlow<()> = open.read(&plans, 1, |_, block| {
+        for message in &block.messages {
+            let topic = &plans.topics[message.topic];
+            probed.read += u64::from(!topic.images.is_empty());
+            if let (Some(loss), false) = (&message.loss, topic.images.is_empty()) {
+                probed.first_loss.get_or_insert_with(|| format!("the first lost as {}: {}", loss.reason, loss.detail));
+            }
+            if let Some((picture, _)) = &message.picture {
+                for &stream in &topic.images {
+                    if let StreamData::Image(rule) = &binding.streams[stream].rule.data {
+                        probed.sizes.entry(stream).or_insert_with(|| picture.size(&rule.spec));
+                    }
+                }
+            }
+            if let Some(stream) = reference.filter(|&stream| binding.streams[stream].topic == topic.topic) {
+                let stamp = message.picture.as_ref().and_then(|(_, stamp)| *stamp);
+                let stamp = stamp.or(message.rows.iter().find_map(|(_, stamp)| *stamp));
+                times.push(match binding.streams[stream].rule.clock {
+                    Clock::Log => message.log_ns,
+                    Clock::Publish => message.publish_ns,
+                    _ => stamp.unwrap_or(message.publish_ns),
+                });
+            }
+        }
+        let has_rate = reference.is_none() || times.len() >= RATE_SAMPLES;
+        if has_rate && images.iter().all(|stream| probed.sizes.contains_key(stream)) {
+            return ControlFlow::Break(());
+        }
+        ControlFlow::Continue(())
+    });
+    probed.without_size = images.into_iter().filter(|stream| !probed.sizes.contains_key(stream)).collect();
+    if reference.is_some() {
+        probed.rate_hz = reference_rate(contract, &mut times)?;
+    }
+    Ok(probed)
+}
+
+/// Returns the rate of reference ticks; over 1 % from an integer the contract must name one.
+fn reference_rate(contract: &CheckedContract, times: &mut [i64]) -> Result<f64, RunError> {
+    times.sort_unstable();
+    let mut steps: Vec<i64> = times.windows(2).map(|pair| pair[1] - pair[0]).filter(|step| *step > 0).collect();
+    steps.sort_unstable();
+    let measured = steps.get(steps.len() / 2).map(|&step| 1e9 / step as f64);
+    if let Some(fps) = contract.written.ticks.fps {
+        return Ok(f64::from(fps));
+    }
+    let rate_hz = measured.unwrap_or(1.0);
+    let nearest = rate_hz.round().max(1.0);
+    if (nearest - rate_hz).abs() > 0.01 * rate_hz {
+        return Err(RunError::Contract(ContractError::Value {
+            file: contract.file.clone(),
+            key: "ticks.fps".to_owned(),
+            expected: format!("an integer to write to info.json: the reference stream has {rate_hz:.3} Hz"),
+            got: "nothing".to_owned(),
+            hint: format!("fps = {nearest} would be {:.1} % off", 100.0 * (nearest / rate_hz - 1.0)),
+        }));
+    }
+    Ok(nearest)
+}

@@ -1,0 +1,449 @@
+//! One recording on its way through the aligner: order, duplicates, clock resets, marks, counts.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::bind::Binding;
+use super::block::{DecodedBlock, DecodedMessage};
+use super::picture::Picture;
+use super::plan::Plans;
+use super::report::Counts;
+use super::sink::{EpisodeSink, IntervalInfo};
+use crate::align::{AlignRule, Aligner, SampleTime, Stop};
+use crate::contract::{CheckedContract, Clock, EpisodeRule, GapRule, NonFiniteRule, StreamData};
+use crate::decode::CameraInfo;
+use crate::episodes::{Mark, Marks};
+use crate::log::Damage;
+
+/// This many messages in a row of one topic, all before the disorder window, mean that its clock was reset.
+const RESET_MESSAGES: usize = 3;
+
+/// Everything that is fixed for a recording.
+pub(crate) struct SessionRules<'a> {
+    pub(crate) contract: &'a CheckedContract,
+    pub(crate) binding: &'a Binding,
+    pub(crate) plans: &'a Plans,
+    pub(crate) rule: &'a AlignRule,
+    /// Expected size of the pictures of each stream, before crop and resize; learned from the first.
+    pub(crate) label_fields: Vec<(String, String)>,
+}
+
+/// The state of a recording.
+pub(crate) struct Session<'a, 's> {
+    rules: &'a SessionRules<'a>,
+    aligner: Aligner<Picture>,
+    pub(crate) sink: EpisodeSink<'s>,
+    pub(crate) counts: Counts,
+    pub(crate) warnings: Vec<String>,
+    pub(crate) damage: Vec<Damage>,
+    pub(crate) camera_infos: BTreeMap<String, CameraInfo>,
+    marks: BTreeMap<(i64, u64), Mark>,
+    is_marked: bool,
+    recent: Vec<Recent>,
+    sizes: BTreeMap<usize, (u32, u32)>,
+    ordinal: u64,
+    newest_log_ns: Option<i64>,
+    segments: u64,
+    reordered: u64,
+    not_in_message: BTreeMap<String, u64>,
+    unclosed: u64,
+    non_finite: BTreeMap<usize, u64>,
+    /// Usable samples per stream over all segments.
+    pub(crate) samples: Vec<u64>,
+}
+
+/// What is remembered of a topic.
+#[derive(Debug, Default, Clone)]
+struct Recent {
+    newest_ns: Option<i64>,
+    /// Messages within the disorder window.
+    seen: BTreeSet<(i64, u32, i64, u32, usize)>,
+}
+
+impl<'a, 's> Session<'a, 's> {
+    pub(crate) fn new(rules: &'a SessionRules<'a>, sink: EpisodeSink<'s>) -> Self {
+        let mut counts = Counts::default();
+        for topic in &rules.plans.topics {
+            counts.add_mapped(&topic.topic);
+        }
+        let mut session = Self {
+            rules,
+            aligner: Aligner::new(rules.rule.clone()),
+            sink,
+            counts,
+            warnings: Vec::new(),
+            damage: Vec::new(),
+            camera_infos: BTreeMap::new(),
+            marks: BTreeMap::new(),
+            is_marked: false,
+            recent: vec![Recent::default(); rules.plans.topics.len()],
+            sizes: BTreeMap::new(),
+            ordinal: 0,
+            newest_log_ns: None,
+            segments: 0,
+            reordered: 0,
+            not_in_message: BTreeMap::new(),
+            unclosed: 0,
+            non_finite: BTreeMap::new(),
+            samples: vec![0; rules.rule.streams.len()],
+        };
+        session.open_segment();
+        session
+    }
+
+    pub(crate) fn plans(&self) -> &'a Plans {
+        self.rules.plans
+    }
+
+    pub(crate) fn newest_log_ns(&self) -> Option<i64> {
+        self.newest_log_ns
+    }
+
+    fn open_segment(&mut self) {
+        match &self.rules.contract.episodes {
+            EpisodeRule::File | EpisodeRule::Gap { .. } => {
+                let id = self.aligner.open_interval(i64::MIN);
+                self.sink.intervals.insert(id + self.sink.interval_base, IntervalInfo::default());
+            }
+            EpisodeRule::Metadata { record, start_key, end_key, scale_ns } => {
+                let records: Vec<_> =
+                    self.sink.recording.metadata.iter().filter(|(name, _)| name == record).cloned().collect();
+                let mut spans = Vec::new();
+                for found in records {
+                    let time = |key: &str| found.1.get(key).and_then(|text| parse_time(text, *scale_ns));
+                    match (time(start_key), time(end_key)) {
+                        (Some(start), Some(end)) if start <= end => spans.push((start, end, found)),
+                        (start, end) => self.warn(format!(
+                            "metadata record {record:?}: expected times in {start_key:?} and {end_key:?}, got {start:?} and {end:?} ns; this episode is left out"
+                        )),
+                    }
+                }
+                spans.sort_by_key(|(start, end, _)| (*start, *end));
+                for (start, end, found) in spans {
+                    let id = self.aligner.open_interval(start);
+                    self.aligner.close_interval(end);
+                    let info = IntervalInfo { record: Some(found), end_ns: Some(end) };
+                    self.sink.intervals.insert(id + self.sink.interval_base, info);
+                }
+            }
+            EpisodeRule::Marker { .. } => self.is_marked = false,
+        }
+    }
+
+    fn warn(&mut self, text: String) {
+        if !self.warnings.contains(&text) {
+            self.warnings.push(text);
+        }
+    }
+
+    /// Takes the next block. `complete_log_ns`: no later block holds an earlier log time; none when that is not known.
+    pub(crate) fn take(
+        &mut self,
+        block: DecodedBlock,
+        is_new_segment: bool,
+        complete_log_ns: Option<i64>,
+    ) -> Result<(), Stop> {
+        self.damage.extend(block.damage);
+        for (topic, count) in &block.unmapped {
+            self.counts.read(topic, *count);
+        }
+        if is_new_segment {
+            self.reset_clock("the file's chunks")?;
+        }
+        let resets = resets_of(&block.messages, self.rules.contract.disorder_window_ns, self.recent.len());
+        for (index, message) in block.messages.into_iter().enumerate() {
+            if let Some(topic) = resets.get(&index) {
+                let name = self.rules.plans.topics[*topic].topic.clone();
+                self.reset_clock(&name)?;
+            }
+            self.take_message(message, &block.values);
+        }
+        let window = self.rules.contract.disorder_window_ns;
+        let complete = complete_log_ns.or(self.newest_log_ns);
+        if let Some(complete) = complete {
+            self.advance(complete.saturating_sub(window))?;
+        }
+        Ok(())
+    }
+
+    /// Makes the rows that remain.
+    pub(crate) fn finish(&mut self) -> Result<(), Stop> {
+        self.close_segment()?;
+        if self.reordered > 0 {
+            let text = format!("{} messages of mapped topics were out of order and have been sorted", self.reordered);
+            self.warn(text);
+        }
+        for (topic, count) in std::mem::take(&mut self.not_in_message) {
+            self.warn(format!("{topic}: {count} messages hold none of the mapped elements, and were passed over"));
+        }
+        if self.unclosed > 0 {
+            let text = format!("{} episodes have no end mark; closed at the next start or at the end of the log", self.unclosed);
+            self.warn(text);
+        }
+        for (stream, count) in std::mem::take(&mut self.non_finite) {
+            let name = &self.rules.binding.streams[stream].name;
+            let text = format!("stream {name:?}: {count} samples hold NaN or infinity; their rows are not valid");
+            self.warn(text);
+        }
+        Ok(())
+    }
+
+    fn close_segment(&mut self) -> Result<(), Stop> {
+        self.apply_marks(i64::MAX);
+        if self.is_marked {
+            self.unclosed += 1;
+        }
+        self.aligner.finish(&mut self.sink)?;
+        for (stream, samples) in self.samples.iter_mut().enumerate() {
+            *samples += self.aligner.samples(stream);
+        }
+        Ok(())
+    }
+
+    fn reset_clock(&mut self, by: &str) -> Result<(), Stop> {
+        self.close_segment()?;
+        let intervals = self.sink.intervals.keys().next_back().map_or(0, |last| last + 1);
+        self.sink.interval_base = intervals.max(self.sink.interval_base);
+        self.segments += 1;
+        let at = self.newest_log_ns.unwrap_or_default();
+        if self.segments <= 10 {
+            self.warn(format!("clock reset of {by} after {at} ns: log times run back; a new episode begins"));
+        } else if self.segments == 11 {
+            self.warn("more clock resets, not listed".to_owned());
+        }
+        self.aligner = Aligner::new(self.rules.rule.clone());
+        self.newest_log_ns = None;
+        self.recent.iter_mut().for_each(|recent| *recent = Recent::default());
+        self.open_segment();
+        Ok(())
+    }
+
+    fn advance(&mut self, complete_ns: i64) -> Result<(), Stop> {
+        self.apply_marks(complete_ns);
+        self.aligner.advance(complete_ns, &mut self.sink)
+    }
+
+    /// Opens and closes intervals by the marks before a time.
+    fn apply_marks(&mut self, complete_ns: i64) {
+        while let Some(entry) = self.marks.first_entry().filter(|entry| entry.key().0 < complete_ns) {
+            let ((time_ns, _), mark) = entry.remove_entry();
+            let last = self.sink.intervals.keys().next_back().copied();
+            match mark {
+                Mark::Start => {
+                    if self.is_marked {
+                        let has_stop = matches!(&self.rules.contract.episodes, EpisodeRule::Marker { stop: Some(_), .. });
+                        self.unclosed += u64::from(has_stop);
+                        self.aligner.close_interval(time_ns - 1);
+                        self.set_end(last, time_ns - 1);
+                    }
+                    let id = self.aligner.open_interval(time_ns);
+                    self.sink.intervals.insert(id + self.sink.interval_base, IntervalInfo::default());
+                    self.is_marked = true;
+                }
+                Mark::Stop if self.is_marked => {
+                    self.aligner.close_interval(time_ns);
+                    self.set_end(last, time_ns);
+                    self.is_marked = false;
+                }
+                Mark::Stop => self.warn("an end mark without a start mark was passed over".to_owned()),
+            }
+        }
+    }
+
+    fn set_end(&mut self, interval: Option<u64>, end_ns: i64) {
+        if let Some(info) = interval.and_then(|interval| self.sink.intervals.get_mut(&interval)) {
+            info.end_ns = Some(end_ns);
+        }
+    }
+
+    fn take_message(&mut self, message: DecodedMessage, values: &[f64]) {
+        let name = self.rules.plans.topics[message.topic].topic.clone();
+        self.counts.read(&name, 1);
+        self.ordinal += 1;
+        let window = self.rules.contract.disorder_window_ns;
+        self.newest_log_ns = Some(self.newest_log_ns.map_or(message.log_ns, |ns| ns.max(message.log_ns)));
+        let recent = &mut self.recent[message.topic];
+        let key = (message.log_ns, message.sequence, message.publish_ns, message.crc, message.length);
+        if !recent.seen.insert(key) {
+            return self.counts.lost(&name, "duplicate", 1, || format!("offset {}", message.offset));
+        }
+        let newest = recent.newest_ns.map_or(message.log_ns, |ns| ns.max(message.log_ns));
+        self.reordered += u64::from(message.log_ns < newest);
+        if recent.seen.len() > 4096 {
+            let low = newest.saturating_sub(window);
+            recent.seen = recent.seen.split_off(&(low, 0, i64::MIN, 0, 0));
+        }
+        recent.newest_ns = Some(newest);
+        if let Some(loss) = &message.loss {
+            return self.counts.lost(&name, loss.reason, 1, || format!("offset {}: {}", message.offset, loss.detail));
+        }
+        self.take_rows(&message, values, &name);
+        self.take_picture(&message, &name);
+        self.take_event(message, &name);
+    }
+
+    fn times(&self, stream: usize, message: &DecodedMessage, stamp_ns: Option<i64>) -> SampleTime {
+        let rule = &self.rules.binding.streams[stream].rule;
+        let time_ns = clock_time(&rule.clock, message, stamp_ns);
+        let clock_ns = time_ns.saturating_add(rule.offset_ns);
+        let key_ns = if self.rules.contract.by_arrival {
+            message.log_ns.saturating_add(rule.offset_ns)
+        } else {
+            clock_ns
+        };
+        SampleTime { key_ns, clock_ns, log_ns: message.log_ns, ordinal: self.ordinal }
+    }
+
+    fn take_rows(&mut self, message: &DecodedMessage, values: &[f64], name: &str) {
+        let topic = &self.rules.plans.topics[message.topic];
+        let mut late = None;
+        for (group, (range, stamp_ns)) in topic.groups.iter().zip(&message.rows) {
+            if range.is_empty() {
+                *self.not_in_message.entry(name.to_owned()).or_default() += 1;
+                continue;
+            }
+            let row = &values[range.clone()];
+            for (stream, columns) in &group.streams {
+                let StreamData::Vector(vector) = &self.rules.binding.streams[*stream].rule.data else { continue };
+                let mut converted: Vec<f64> = row[columns.clone()].to_vec();
+                if !vector.unit.is_identity() {
+                    converted.iter_mut().for_each(|value| *value = vector.unit.apply(*value));
+                }
+                if converted.iter().any(|value| !value.is_finite()) {
+                    if self.rules.binding.streams[*stream].rule.non_finite == NonFiniteRule::Reject {
+                        self.counts.lost(name, "non_finite", 1, || format!("offset {}", message.offset));
+                        return;
+                    }
+                    *self.non_finite.entry(*stream).or_default() += 1;
+                }
+                let time = self.times(*stream, message, *stamp_ns);
+                if let Err(error) = self.aligner.push_values(*stream, time, &converted) {
+                    late = Some(error);
+                }
+            }
+        }
+        if let Some(late) = late {
+            self.count_late(name, message, late);
+        }
+    }
+
+    fn count_late(&mut self, name: &str, message: &DecodedMessage, late: crate::align::Late) {
+        let behind_ms = (late.complete_ns - late.key_ns) as f64 / 1e6;
+        self.counts.lost(name, "beyond_disorder_window", 1, || {
+            format!("offset {}: its time {} ns is {behind_ms:.1} ms before what was complete; raise disorder_window_ms, or choose another clock", message.offset, late.key_ns)
+        });
+    }
+
+    fn take_picture(&mut self, message: &DecodedMessage, name: &str) {
+        let Some((picture, stamp_ns)) = &message.picture else { return };
+        let rules = self.rules;
+        for &stream in &rules.plans.topics[message.topic].images {
+            let size = picture.recorded_size();
+            let expected = *self.sizes.entry(stream).or_insert(size);
+            if size != expected {
+                self.counts.lost(name, "image_size_changed", 1, || {
+                    format!("offset {}: expected {}x{}, got {}x{}", message.offset, expected.0, expected.1, size.0, size.1)
+                });
+                return;
+            }
+            let time = self.times(stream, message, *stamp_ns);
+            if let Err(late) = self.aligner.push_image(stream, time, picture.clone()) {
+                self.count_late(name, message, late);
+                return;
+            }
+        }
+    }
+
+    fn take_event(&mut self, message: DecodedMessage, name: &str) {
+        if let Some(info) = message.camera_info {
+            self.camera_infos.entry(name.to_owned()).or_insert(*info);
+        }
+        let Some(event) = message.event else { return };
+        if let EpisodeRule::Marker { topic, field, start, stop, clock } = &self.rules.contract.episodes
+            && topic == name
+        {
+            let marks = Marks { field: field.clone(), start: start.clone(), stop: stop.clone() };
+            let stamp_ns = match clock {
+                Clock::Field(path) => crate::episodes::value_at(&event, path)
+                    .and_then(|value| value.as_f64())
+                    .map(|value| if value.abs() < 1e12 { value * 1e9 } else { value })
+                    .map(|ns| ns as i64),
+                _ => None,
+            };
+            let time_ns = match (clock, stamp_ns) {
+                (Clock::Field(_), Some(ns)) => ns,
+                (Clock::Publish, _) => message.publish_ns,
+                _ => message.log_ns,
+            };
+            if let Some(mark) = marks.read(&event) {
+                self.marks.insert((time_ns, self.ordinal), mark);
+            }
+        }
+        self.sink.recording.take(name, &self.rules.label_fields, message.log_ns, &event);
+    }
+}
+
+fn clock_time(clock: &Clock, message: &DecodedMessage, stamp_ns: Option<i64>) -> i64 {
+    match clock {
+        Clock::Log => message.log_ns,
+        Clock::Publish => message.publish_ns,
+        Clock::Stamp | Clock::Field(_) => stamp_ns.unwrap_or(message.publish_ns),
+    }
+}
+
+fn parse_time(text: &str, scale_ns: f64) -> Option<i64> {
+    let text = text.trim();
+    if scale_ns == 1.0
+        && let Ok(ns) = text.parse::<i64>()
+    {
+        return Some(ns);
+    }
+    let value = text.parse::<f64>().ok()? * scale_ns;
+    (value.abs() < 9e18).then_some(value.round() as i64)
+}
+
+/// Returns where clocks are reset within a block: index of the first message after, and the topic that tells.
+///
+/// A topic tells of a reset when its times run back by more than the window for [`RESET_MESSAGES`] messages on end, or
+/// up to the end of the block; a single message that runs back is a late one.
+fn resets_of(messages: &[DecodedMessage], window_ns: i64, n_topics: usize) -> BTreeMap<usize, usize> {
+    let mut resets = BTreeMap::new();
+    let mut newest: Vec<Option<i64>> = vec![None; n_topics];
+    let mut last_good = vec![0; n_topics];
+    let mut back: Vec<Vec<usize>> = vec![Vec::new(); n_topics];
+    let mut index = 0;
+    while index < messages.len() {
+        let message = &messages[index];
+        let topic = message.topic;
+        if newest[topic].is_some_and(|ns| message.log_ns.saturating_add(window_ns) < ns) {
+            back[topic].push(index);
+        } else {
+            back[topic].clear();
+            newest[topic] = Some(newest[topic].map_or(message.log_ns, |ns| ns.max(message.log_ns)));
+            last_good[topic] = index;
+        }
+        let n_back = back[topic].len();
+        if n_back >= RESET_MESSAGES || (index + 1 == messages.len() && n_back > 0) {
+            // Other topics go on from their own first message back, if it comes after this topic's last good one.
+            let after = last_good[topic];
+            let firsts = back.iter().filter_map(|back| back.iter().find(|&&first| first > after));
+            let first = firsts.min().copied().unwrap_or(index);
+            resets.insert(first, topic);
+            newest.iter_mut().for_each(|newest| *newest = None);
+            back.iter_mut().for_each(Vec::clear);
+            // What lies between is looked at again, as part of the new segment.
+            index = first;
+            newest[messages[first].topic] = Some(messages[first].log_ns);
+            last_good[messages[first].topic] = first;
+        }
+        index += 1;
+    }
+    resets
+}
+
+impl Session<'_, '_> {
+    /// Returns the streams that rows wait for and that had no usable sample.
+    pub(crate) fn empty_streams(&self) -> Vec<usize> {
+        let required = |stream: &usize| self.rules.binding.streams[*stream].rule.gap != GapRule::Mask;
+        (0..self.samples.len()).filter(|&stream| self.samples[stream] == 0).filter(required).collect()
+    }
+}

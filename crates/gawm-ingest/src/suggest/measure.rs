@@ -1,0 +1,264 @@
+//! Refines a draft by what the values do: wrapped angles, the delay between commands and states.
+
+use std::collections::BTreeMap;
+use std::ops::ControlFlow;
+
+use gawm_schema::Wrap;
+
+use super::Suggestion;
+use super::lag::{Following, Series, following};
+use super::survey::Survey;
+use crate::contract::{
+    ActionTimingSpec, AlignSpec, Clock, KindSpec, ReduceSpec, RoleSpec, StreamSpec, check,
+};
+use crate::decode::SchemaLibrary;
+use crate::run::{BindError, Binding, Plans};
+
+/// Samples per stream that are looked at.
+const MAX_SAMPLES: usize = 40_000;
+/// A correlation below this says nothing.
+const MIN_CORRELATION: f64 = 0.7;
+/// Columns of an action that are compared with the state, at most.
+const MAX_COLUMNS: usize = 32;
+
+/// Refines kinds and timings.
+pub(crate) fn refine(suggestion: &mut Suggestion, survey: &Survey, library: &SchemaLibrary) {
+    remove_unbindable(suggestion, survey, library);
+    let Some(series) = read(suggestion, survey, library) else { return };
+    split_by_wrap(suggestion, &series);
+    let Some(series) = read(suggestion, survey, library) else { return };
+    time_actions(suggestion, survey, &series);
+}
+
+/// The values of one stream, by column.
+type StreamSeries = BTreeMap<usize, Vec<Series>>;
+
+/// Drops streams whose fields do not compile after all, with the reason.
+fn remove_unbindable(suggestion: &mut Suggestion, survey: &Survey, library: &SchemaLibrary) {
+    for _ in 0..suggestion.contract.stream.len() {
+        let Ok(checked) = check(&suggestion.contract, "suggestion") else { return };
+        let at = match Binding::new(&checked, &survey.first.name, &survey.first.channels, library) {
+            Ok(_) => return,
+            Err(BindError::Run(error)) => {
+                let text = error.to_string();
+                let found = checked.streams.iter().position(|stream| {
+                    stream.name.as_ref().is_some_and(|name| text.contains(&format!("{name:?}")))
+                });
+                found.map(|at| (at, text))
+            }
+            Err(BindError::Refused(refusal)) => Some((0, refusal.to_string())),
+        };
+        let Some((at, text)) = at else { return };
+        let stream = suggestion.contract.stream.remove(at);
+        suggestion.stream_reasons.remove(at);
+        suggestion.unmapped.push(format!("{}: {text}", stream.topic.unwrap_or_default()));
+    }
+}
+
+/// Reads the values of all vector streams of the first recording.
+fn read(suggestion: &Suggestion, survey: &Survey, library: &SchemaLibrary) -> Option<StreamSeries> {
+    let checked = check(&suggestion.contract, "suggestion").ok()?;
+    let binding = Binding::new(&checked, &survey.first.name, &survey.first.channels, library).ok()?;
+    let plans = Plans::new(&binding, &[], &[], library);
+    let mut all: StreamSeries = BTreeMap::new();
+    let _: ControlFlow<()> = survey.first.read(&plans, 1, |_, block| {
+        for message in block.messages.iter().filter(|message| message.loss.is_none()) {
+            for (group, (range, stamp_ns)) in plans.topics[message.topic].groups.iter().zip(&message.rows) {
+                if range.is_empty() {
+                    continue;
+                }
+                for (stream, columns) in &group.streams {
+                    let bound = &binding.streams[*stream];
+                    let series = all.entry(bound.rule.index).or_insert_with(|| vec![Series::default(); columns.len()]);
+                    let ns = match bound.rule.clock {
+                        Clock::Log => message.log_ns,
+                        Clock::Publish => message.publish_ns,
+                        _ => stamp_ns.unwrap_or(message.publish_ns),
+                    };
+                    let is_next = series[0].times_ns.last().is_none_or(|&last| ns > last);
+                    if !is_next || series[0].times_ns.len() >= MAX_SAMPLES {
+                        continue;
+                    }
+                    let values = &block.values[range.clone()][columns.clone()];
+                    for (series, &value) in series.iter_mut().zip(values) {
+                        series.times_ns.push(ns);
+                        series.values.push(value);
+                    }
+                }
+            }
+        }
+        ControlFlow::Continue(())
+    });
+    Some(all)
+}
+
+/// Splits streams of angles where some wrap and others do not.
+fn split_by_wrap(suggestion: &mut Suggestion, series: &StreamSeries) {
+    let mut streams = Vec::new();
+    let mut reasons = Vec::new();
+    for (index, stream) in suggestion.contract.stream.iter().enumerate() {
+        let own = &suggestion.stream_reasons[index];
+        let wraps: Vec<Wrap> = match series.get(&index) {
+            Some(columns) if stream.kind == KindSpec::Angle && columns.len() == stream.fields.len() => {
+                columns.iter().map(|column| wrap_of(&column.values)).collect()
+            }
+            _ => vec![Wrap::None; stream.fields.len().max(1)],
+        };
+        let mut at = 0;
+        while at < wraps.len() {
+            let n = wraps[at..].iter().take_while(|wrap| **wrap == wraps[at]).count();
+            let mut part = stream.clone();
+            let mut why = own.clone();
+            if n < wraps.len() {
+                part.fields = stream.fields[at..at + n].to_vec();
+                if stream.limits.len() == wraps.len() {
+                    part.limits = stream.limits[at..at + n].to_vec();
+                }
+            }
+            if wraps[at] != Wrap::None {
+                part.wrap = Some(wraps[at]);
+                why.push("wrap: the value jumps by a turn between samples".to_owned());
+            }
+            streams.push(part);
+            reasons.push(why);
+            at += n;
+        }
+    }
+    suggestion.contract.stream = streams;
+    suggestion.stream_reasons = reasons;
+}
+
+/// Returns the interval that angles are wrapped to: told by jumps of nearly a turn.
+fn wrap_of(values: &[f64]) -> Wrap {
+    use std::f64::consts::PI;
+    let has_jump = values.windows(2).any(|pair| ((pair[1] - pair[0]).abs() - 2.0 * PI).abs() < 1.0);
+    let (low, high) = values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
+    match has_jump {
+        false => Wrap::None,
+        true if low >= -1e-6 && high <= 2.0 * PI + 1e-3 => Wrap::TwoPi,
+        true if low >= -PI - 1e-3 && high <= PI + 1e-3 => Wrap::Pi,
+        true => Wrap::None,
+    }
+}
+
+fn time_actions(suggestion: &mut Suggestion, survey: &Survey, series: &StreamSeries) {
+    let states: Vec<usize> = (0..suggestion.contract.stream.len())
+        .filter(|&index| suggestion.contract.stream[index].role != Some(RoleSpec::Action))
+        .filter(|index| series.contains_key(index))
+        .collect();
+    let kinds: Vec<(KindSpec, Option<Wrap>, Option<String>)> =
+        suggestion.contract.stream.iter().map(|stream| (stream.kind, stream.wrap, stream.unit.clone())).collect();
+    let tick_hz = suggestion.contract.ticks.rate_hz.unwrap_or(10.0);
+    for (index, stream) in suggestion.contract.stream.iter_mut().enumerate() {
+        if stream.role != Some(RoleSpec::Action) || stream.topic.is_none() {
+            continue;
+        }
+        let columns = series.get(&index).map_or(&[][..], Vec::as_slice);
+        let found: Vec<(usize, Following)> =
+            columns.iter().take(MAX_COLUMNS).filter_map(|column| best_state(column, &states, series)).collect();
+        let reasons = &mut suggestion.stream_reasons[index];
+        let topic = stream.topic.as_deref().and_then(|topic| survey.topics.get(topic));
+        let rate_hz = topic.map_or(0.0, super::survey::Topic::rate_hz);
+        apply(stream, reasons, &found, columns.len(), &kinds, rate_hz / tick_hz);
+    }
+}
+
+/// Returns the state column that follows a command best.
+fn best_state(command: &Series, states: &[usize], series: &StreamSeries) -> Option<(usize, Following)> {
+    let mut best: Option<(usize, Following)> = None;
+    for &state in states {
+        for column in &series[&state] {
+            if let Some(found) = following(command, column)
+                && best.is_none_or(|(_, other)| found.correlation > other.correlation)
+            {
+                best = Some((state, found));
+            }
+        }
+    }
+    best.filter(|(_, found)| found.correlation >= MIN_CORRELATION)
+}
+
+fn apply(
+    stream: &mut StreamSpec,
+    reasons: &mut Vec<String>,
+    found: &[(usize, Following)],
+    n_columns: usize,
+    kinds: &[(KindSpec, Option<Wrap>, Option<String>)],
+    commands_per_tick: f64,
+) {
+    let name = stream.topic.clone().unwrap_or_default();
+    let is_delta = super::names::is_delta(&name);
+    let n_velocity = found.iter().filter(|(_, following)| following.is_velocity).count();
+    let is_velocity = !is_delta && (2 * n_velocity > found.len() || (found.is_empty() && super::names::is_velocity(&name)));
+    let is_told = 2 * found.len() >= n_columns.max(1);
+    if is_told {
+        let mut lags: Vec<f64> = found.iter().map(|(_, following)| following.lag_s * 1e3).collect();
+        lags.sort_by(f64::total_cmp);
+        let lag_ms = lags[lags.len() / 2];
+        let correlation = found.iter().map(|(_, f)| f.correlation).fold(f64::INFINITY, f64::min);
+        let what = if is_delta { "step" } else if is_velocity { "velocity" } else { "position" };
+        stream.offset_ms = if lag_ms >= 1.0 { (lag_ms * 10.0).round() / 10.0 } else { 0.0 };
+        reasons.push(format!(
+            "offset: the state follows this {what} command after {lag_ms:.1} ms (correlation of {} of {n_columns} columns at least {correlation:.2}), so it acts that much later",
+            found.len()
+        ));
+        if !is_velocity && !is_delta && stream.kind == KindSpec::Linear {
+            adopt_kind(stream, reasons, found, kinds);
+        }
+    } else {
+        reasons.push("offset: no clear delay between this command and the state; 0 until you know better".to_owned());
+    }
+    if is_velocity && stream.unit.is_none() && stream.kind == KindSpec::Linear && is_told {
+        let state = found.first().map(|(state, _)| &kinds[*state]);
+        if let Some((KindSpec::Angle, ..)) = state {
+            stream.unit = Some("rad/s".to_owned());
+            reasons.push("unit: the velocity of joint angles".to_owned());
+        }
+    }
+    let Some(action) = &mut stream.action else { return };
+    if commands_per_tick >= 1.5 {
+        action.timing = ActionTimingSpec::Window;
+        let reduce = match (is_delta, is_velocity, stream.kind) {
+            (true, _, KindSpec::Rotvec | KindSpec::Quaternion | KindSpec::Matrix | KindSpec::Euler) => ReduceSpec::Compose,
+            (true, ..) => ReduceSpec::Sum,
+            (false, true, KindSpec::Linear | KindSpec::Angle) => ReduceSpec::Mean,
+            _ => ReduceSpec::Last,
+        };
+        action.reduce = Some(reduce);
+        reasons.push(format!("timing: {commands_per_tick:.1} commands per row become one"));
+        if stream.align == Some(AlignSpec::Hold) && stream.tolerance_ms.is_none() && is_delta {
+            reasons.push("a row without a command ends the episode: steps cannot be held".to_owned());
+        }
+    } else {
+        reasons.push("timing: at most about one command per row: the one in force".to_owned());
+    }
+}
+
+/// A position command that follows joint angles is one of joint angles.
+fn adopt_kind(
+    stream: &mut StreamSpec,
+    reasons: &mut Vec<String>,
+    found: &[(usize, Following)],
+    kinds: &[(KindSpec, Option<Wrap>, Option<String>)],
+) {
+    let angles = found.iter().filter(|(state, _)| kinds[*state].0 == KindSpec::Angle).count();
+    if angles == found.len() && stream.unit.is_none() && angles > 0 {
+        reasons.push(
+            "kind: its columns follow joint angles, but a command may hold others too, so it is left linear; say kind = \"angle\" if all are"
+                .to_owned(),
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn wraps_are_told_by_jumps() {
+        assert_eq!(wrap_of(&[3.0, 3.1, -3.1, -3.0]), Wrap::Pi);
+        assert_eq!(wrap_of(&[6.0, 6.2, 0.1, 0.3]), Wrap::TwoPi);
+        assert_eq!(wrap_of(&[0.0, 1.0, 2.0]), Wrap::None);
+        assert_eq!(wrap_of(&[3.0, 9.3, 3.1]), Wrap::None);
+    }
+}

@@ -1,0 +1,92 @@
+//! What the names of topics and fields say.
+
+/// Returns the words of a name, in lower case: `/arm/JointCommand_2` gives arm, joint, command, 2.
+pub(crate) fn words(name: &str) -> Vec<String> {
+    let mut words = Vec::new();
+    let mut word = String::new();
+    let mut was_lower = false;
+    for char in name.chars() {
+        let is_break = !char.is_alphanumeric() || (char.is_uppercase() && was_lower);
+        if is_break && !word.is_empty() {
+            words.push(std::mem::take(&mut word));
+        }
+        if char.is_alphanumeric() {
+            word.extend(char.to_lowercase());
+        }
+        was_lower = char.is_lowercase() || char.is_numeric();
+    }
+    if !word.is_empty() {
+        words.push(word);
+    }
+    words
+}
+
+fn has(name: &str, wanted: &[&str]) -> bool {
+    words(name).iter().any(|word| wanted.contains(&word.as_str()))
+}
+
+/// Words that commands go by.
+const COMMAND: [&str; 15] = [
+    "command", "commands", "cmd", "cmds", "action", "actions", "target", "targets", "setpoint", "setpoints", "desired",
+    "goal", "reference", "ctrl", "control",
+];
+
+pub(crate) fn is_command(name: &str) -> bool {
+    has(name, &COMMAND)
+}
+
+pub(crate) fn is_gripper(name: &str) -> bool {
+    has(name, &["gripper", "grippers", "finger", "fingers", "grip", "jaw", "hand"])
+}
+
+pub(crate) fn is_delta(name: &str) -> bool {
+    has(name, &["delta", "deltas", "relative", "increment", "incremental"])
+}
+
+pub(crate) fn is_velocity(name: &str) -> bool {
+    has(name, &["velocity", "velocities", "vel", "twist", "speed", "speeds"])
+}
+
+pub(crate) fn is_recording(name: &str) -> bool {
+    has(name, &["recording", "record", "episode", "episodes", "is_recording", "rec", "trial", "demo"])
+}
+
+pub(crate) fn is_task(name: &str) -> bool {
+    has(name, &["task", "tasks", "instruction", "instructions", "prompt", "language", "goal_text"])
+}
+
+/// Topics of middleware that say nothing of the robot's state.
+pub(crate) fn is_housekeeping(topic: &str, type_name: &str) -> bool {
+    let bare = type_name.rsplit(['/', '.']).next().unwrap_or("");
+    matches!(
+        bare,
+        "Log" | "ParameterEvent" | "WriteSplitEvent" | "DiagnosticArray" | "TFMessage" | "FrameTransform"
+            | "FrameTransforms" | "CameraInfo" | "CameraCalibration" | "Clock" | "Statistics"
+    ) || topic.ends_with("/clock")
+        || matches!(topic, "/rosout" | "/rosout_agg" | "/parameter_events" | "/tf" | "/tf_static")
+}
+
+/// Times, counters and labels within a message are no measurements.
+pub(crate) fn is_bookkeeping(path: &str) -> bool {
+    let last = path.rsplit('.').next().unwrap_or(path);
+    let first = path.split(['.', '[']).next().unwrap_or(path);
+    matches!(first, "header" | "stamp" | "timestamp" | "layout")
+        || matches!(
+            last,
+            "t" | "time" | "sec" | "secs" | "nsec" | "nsecs" | "nanosec" | "nanos" | "seconds" | "seq" | "sequence"
+                | "stamp" | "timestamp" | "id" | "index" | "frame_id" | "counter"
+        )
+        || path.contains("covariance")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_of_names() {
+        assert_eq!(words("/arm/JointCommand_2"), ["arm", "joint", "command", "2"]);
+        assert!(is_command("/cell/velocity_command") && is_command("/cmd_vel") && !is_command("/recommended"));
+        assert!(is_bookkeeping("header.stamp.sec") && is_bookkeeping("t") && !is_bookkeeping("pose.position.x"));
+    }
+}
