@@ -24,6 +24,9 @@ pub struct StreamInfo {
     pub name: String,
     /// Topic or dataset path in the source.
     pub source: String,
+    /// What its column is for, where a row may use samples of after its tick: an action acts until the next one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub role: Option<Role>,
 }
 
 /// One column of the dataset that carries robot data.

@@ -116,15 +116,20 @@ impl DimStats {
             n_missing: self.n_missing,
             min: moments.min().unwrap_or(0.0),
             max: moments.max().unwrap_or(0.0),
-            mean: moments.mean(),
-            std: moments.std(),
-            q01,
-            q10,
-            q50,
-            q90,
-            q99,
+            mean: finite(moments.mean()),
+            std: finite(moments.std()),
+            q01: finite(q01),
+            q10: finite(q10),
+            q50: finite(q50),
+            q90: finite(q90),
+            q99: finite(q99),
         }
     }
+}
+
+/// Keeps what overflowed, since JSON knows neither infinity nor NaN: values near the end of f64 have no spread in f64.
+fn finite(value: f64) -> f64 {
+    if value.is_nan() { f64::MAX } else { value.clamp(f64::MIN, f64::MAX) }
 }
 
 impl Circular {

@@ -22,6 +22,9 @@ const LN2_LOW: f32 = (std::f64::consts::LN_2 / ENTRIES as f64 - LN2_HIGH as f64)
 /// Adding and subtracting this rounds a small number to the nearest integer, ties to even; the low bits hold it.
 const ROUNDER: f32 = 12_582_912.0;
 
+/// Most numbers that [`ExpTable::exp_row`] takes: the side of a frame.
+const ROW: usize = 224;
+
 /// Smallest argument that [`ExpTable::exp`] takes: below it results are not normal numbers.
 pub(crate) const LOWEST_ARGUMENT: f32 = -87.0;
 
@@ -43,18 +46,40 @@ impl ExpTable {
     }
 
     /// Returns e^x for `LOWEST_ARGUMENT <= x <= 0`, with the last bit of the published renderer.
-    #[inline]
     pub(crate) fn exp(&self, x: f32) -> f32 {
-        // x = (128 m + j) ln2 / 128 + r, so e^x = 2^m 2^(j/128) (1 + r + r^2 / 2).
-        let rounded = x * PER_LN2 + ROUNDER;
-        let index = rounded.to_bits().wrapping_sub(ROUNDER.to_bits()) as i32;
-        let n = rounded - ROUNDER;
-        let r = (x - n * LN2_HIGH) - n * LN2_LOW;
-        let p = r + 0.5 * r * r;
+        let (index, p) = reduce(x);
+        self.rebuild(index, p)
+    }
+
+    /// Replaces up to `ROW` arguments by their exponentials. In two passes, since the first has no table and can be
+    /// done several numbers at a time.
+    pub(crate) fn exp_row(&self, row: &mut [f32]) {
+        let mut indices = [0_i32; ROW];
+        let mut polynomials = [0.0_f32; ROW];
+        for ((index, p), &x) in indices.iter_mut().zip(&mut polynomials).zip(&*row) {
+            (*index, *p) = reduce(x);
+        }
+        for ((index, p), x) in indices.into_iter().zip(polynomials).zip(row) {
+            *x = self.rebuild(index, p);
+        }
+    }
+
+    #[inline]
+    fn rebuild(&self, index: i32, p: f32) -> f32 {
         let (high, low) = self.0[(index & (ENTRIES as i32 - 1)) as usize];
         let y = high + (low + high * p);
         f32::from_bits(y.to_bits().wrapping_add_signed((index >> 7) << 23))
     }
+}
+
+/// Splits x = (128 m + j) ln2 / 128 + r into the index 128 m + j and r + r^2 / 2: e^x is 2^m 2^(j/128) (1 + r + r^2 / 2).
+#[inline]
+fn reduce(x: f32) -> (i32, f32) {
+    let rounded = x * PER_LN2 + ROUNDER;
+    let index = rounded.to_bits().wrapping_sub(ROUNDER.to_bits()) as i32;
+    let n = rounded - ROUNDER;
+    let r = (x - n * LN2_HIGH) - n * LN2_LOW;
+    (index, r + 0.5 * r * r)
 }
 
 #[cfg(test)]

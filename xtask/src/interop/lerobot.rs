@@ -18,10 +18,8 @@ pub(crate) struct Arguments {
 }
 
 /// The fixtures that are ingested: name, contract, log.
-const FIXTURES: &[(&str, &str, &str)] = &[
-    ("demo", "pipelines/demo.toml", "fixtures/demo/demo.mcap"),
-    ("arm", "pipelines/arm-mcap.toml", "fixtures/arm/base_short.mcap"),
-];
+const FIXTURES: &[(&str, &str, &str)] =
+    &[("demo", "pipelines/demo.toml", "fixtures/mcap-explorer-demo/demo.mcap")];
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let folder = root().join("target/interop-lerobot");

@@ -1,5 +1,6 @@
 //! `xtask interop ...`: what other people's software makes of our files, and we of theirs.
 
+mod lerobot;
 mod python;
 mod torch;
 
@@ -20,12 +21,15 @@ pub(crate) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum With {
+    /// Open our datasets with the published `lerobot`.
+    Lerobot(lerobot::Arguments),
     /// Exchange weights with the published PyTorch modules, both ways.
     Torch(torch::Arguments),
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     match &arguments.with {
+        With::Lerobot(arguments) => lerobot::run(arguments),
         With::Torch(arguments) => torch::run(arguments),
     }
 }

@@ -4,6 +4,8 @@ use super::{
     Finding, Severity, Thresholds,
     robust::{median, quantile},
 };
+use gawm_schema::Role;
+
 use crate::read::{Dataset, EpisodeRows};
 
 /// What is kept of a run's clock, for reports.
@@ -205,10 +207,15 @@ impl Context<'_> {
         let ages = rows.column("gawm.age_ms").map(|c| c.dims()).unwrap_or_default();
         let arrivals = rows.column("gawm.arrival_age_ms").map(|c| c.dims()).unwrap_or_default();
         let stale = bounds.stale_periods * self.period * 1e3;
+        // What acts between a row and the next may have been commanded up to a period after the row.
+        let earliest_ms = |i: usize| {
+            let role = dataset.schema.as_ref().and_then(|s| s.streams.get(i)?.role);
+            if role == Some(Role::Action) { -self.period * 1e3 - 0.5 } else { -0.5 }
+        };
         for (i, age) in ages.iter().enumerate() {
-            let n_future = age.iter().filter(|a| **a < -0.5).count();
+            let n_future = age.iter().filter(|a| **a < earliest_ms(i)).count();
             if n_future > 0 {
-                let row = age.iter().position(|a| *a < -0.5).unwrap_or(0);
+                let row = age.iter().position(|a| *a < earliest_ms(i)).unwrap_or(0);
                 let message = format!(
                     "{n_future} rows use a sample of stream {} from up to {:.1} ms later",
                     stream(i),

@@ -212,7 +212,11 @@ impl Binding {
         let streams = self
             .streams
             .iter()
-            .map(|stream| StreamInfo { name: stream.name.clone(), source: stream.topic.clone() })
+            .map(|stream| StreamInfo {
+                name: stream.name.clone(),
+                source: stream.topic.clone(),
+                role: Some(stream.rule.role),
+            })
             .collect();
         Ok(Schema { robot_type: contract.written.robot_type.clone(), rate_hz, features, streams })
     }

@@ -6,6 +6,9 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Moments {
     count: u64,
+    /// The first value; all means are relative to it, so that a large offset costs no digits of the spread.
+    origin: f64,
+    /// Mean relative to `origin`.
     mean: f64,
     /// Sum of squared deviations from the mean.
     m2: f64,
@@ -17,13 +20,14 @@ impl Moments {
     /// Takes one finite value (Welford).
     pub fn update(&mut self, value: f64) {
         if self.count == 0 {
-            *self = Moments { count: 1, mean: value, m2: 0.0, min: value, max: value };
+            *self = Moments { count: 1, origin: value, mean: 0.0, m2: 0.0, min: value, max: value };
             return;
         }
         self.count += 1;
-        let delta = value - self.mean;
+        let offset = value - self.origin;
+        let delta = offset - self.mean;
         self.mean += delta / self.count as f64;
-        self.m2 += delta * (value - self.mean);
+        self.m2 += delta * (offset - self.mean);
         self.min = self.min.min(value);
         self.max = self.max.max(value);
     }
@@ -38,7 +42,7 @@ impl Moments {
             return;
         }
         let (n, m) = (self.count as f64, later.count as f64);
-        let delta = later.mean - self.mean;
+        let delta = (later.origin - self.origin) + (later.mean - self.mean);
         self.count += later.count;
         self.mean += delta * (m / (n + m));
         self.m2 += later.m2 + delta * delta * (n * m / (n + m));
@@ -53,7 +57,7 @@ impl Moments {
 
     /// Returns the mean; 0 without values.
     pub fn mean(&self) -> f64 {
-        self.mean
+        self.origin + self.mean
     }
 
     /// Returns the smallest value.

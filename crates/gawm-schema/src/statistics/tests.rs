@@ -57,10 +57,20 @@ fn a_large_offset_does_not_destroy_the_spread() {
     let (mean, std) = two_pass(&values.iter().map(|v| v - 1e9).collect::<Vec<_>>());
     let moments = stats(&values).moments;
     check_close(moments.mean(), 1e9 + mean, 1e-15);
-    check_close(moments.std() / std, 1.0, 1e-6);
+    check_close(moments.std() / std, 1.0, 1e-12);
+    let mut merged = Moments::default();
+    values.chunks(777).for_each(|part| merged.merge(&stats(part).moments));
+    check_close(merged.std() / std, 1.0, 1e-12);
     let constant = stats(&[0.1; 1000]).moments;
     assert!(constant.is_constant() && constant.std() == 0.0);
     check_close(moments.sample_std() / moments.std(), (10_000.0f64 / 9_999.0).sqrt(), 1e-12);
+}
+
+#[test]
+fn summaries_are_finite_whatever_the_values() {
+    let summary = stats(&[f64::MAX, f64::MIN, 1e200, -1e200]).summary();
+    let text = serde_json::to_string(&summary).unwrap();
+    assert!(!text.contains("null"), "{text}");
 }
 
 /// Returns the largest rank error of the summary's quantiles, as a share of the count.

@@ -111,8 +111,10 @@ fn blend_dot(rgb: &mut [u8], dot: Dot, center: [f32; 2]) {
         let columns = pixels_within(center[0], reach_squared - squares[1][y]);
         let weights = &mut weights[..columns.len()];
         for (weight, &dx_squared) in weights.iter_mut().zip(&squares[0][columns.clone()]) {
-            *weight = table.exp(-(dx_squared + squares[1][y]) / dot.denominator) / peak;
+            *weight = -(dx_squared + squares[1][y]) / dot.denominator;
         }
+        table.exp_row(weights);
+        weights.iter_mut().for_each(|weight| *weight /= peak);
         let row = &mut rgb[(y * FRAME_SIZE + columns.start) * 3..(y * FRAME_SIZE + columns.end) * 3];
         blend_row(row, weights, dot.color);
     }
@@ -139,11 +141,33 @@ fn pixels_within(center: f32, reach_squared: f32) -> std::ops::Range<usize> {
 }
 
 /// Blends `color` over a row of pixels, one weight per pixel; truncates as the published renderer does.
+///
+/// The channels are taken apart first, so that several pixels can be blended at a time.
 fn blend_row(row: &mut [u8], weights: &[f32], color: [u8; 3]) {
-    let color = color.map(f32::from);
-    for (pixel, &weight) in row.chunks_exact_mut(3).zip(weights) {
-        for (value, color) in pixel.iter_mut().zip(color) {
-            *value = (f32::from(*value) * (1.0 - weight) + color * weight) as u8;
+    let mut channels = [[0_u8; FRAME_SIZE]; 3];
+    for (i, pixel) in row.chunks_exact(3).enumerate().take(FRAME_SIZE) {
+        for (channel, &value) in channels.iter_mut().zip(pixel) {
+            channel[i] = value;
         }
     }
+    for (channel, color) in channels.iter_mut().zip(color.map(f32::from)) {
+        for (value, &weight) in channel.iter_mut().zip(weights) {
+            *value = truncate(f32::from(*value) * (1.0 - weight) + color * weight);
+        }
+    }
+    for (i, pixel) in row.chunks_exact_mut(3).enumerate().take(FRAME_SIZE) {
+        for (value, channel) in pixel.iter_mut().zip(&channels) {
+            *value = channel[i];
+        }
+    }
+}
+
+/// Truncates a number from 0 to below 256. A cast would do, but its checks keep it from being done several at a time.
+#[inline]
+fn truncate(value: f32) -> u8 {
+    /// Adding this rounds to the nearest integer, which the low bits then hold.
+    const ROUNDER: f32 = 8_388_608.0;
+    let rounded = value + ROUNDER;
+    let is_above = rounded - ROUNDER > value;
+    (rounded.to_bits() as u8).wrapping_sub(u8::from(is_above))
 }

@@ -1,1 +1,0 @@
-//! Batches between processes in fixed-layout shared-memory slots.
