@@ -10,14 +10,16 @@
 mod action;
 mod aligner;
 mod buffer;
+mod event;
 mod interpolate;
 mod spec;
 
 #[cfg(test)]
 mod tests;
 
-pub use aligner::{Aligner, EndReason, EpisodeStart, GapEvent, Late, Row, RowSink, Stop};
+pub use aligner::Aligner;
 pub use buffer::SampleTime;
+pub use event::{EndReason, EpisodeStart, GapEvent, Late, Row, RowSink, Stop};
 pub use spec::{
     ActionTiming, AlignRule, Derivation, FeatureRule, GapAction, Method, PartKind, Reduction, StreamRule,
     Ticks,

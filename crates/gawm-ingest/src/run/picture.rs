@@ -81,6 +81,11 @@ impl Picture {
         })
     }
 
+    /// Returns how many bytes the image holds.
+    pub(crate) fn held_bytes(&self) -> usize {
+        self.data.len()
+    }
+
     /// Returns width and height as recorded.
     pub(crate) fn recorded_size(&self) -> (u32, u32) {
         (self.width, self.height)

@@ -16,6 +16,8 @@ use crate::episodes::{EpisodeLabels, Labels, RecordingLabels};
 
 /// Rows that are handed to the writer at once.
 const PIECE_ROWS: usize = 64;
+/// Image bytes that may wait in such a piece.
+const PIECE_BYTES: usize = 32 << 20;
 
 /// What is fixed for a run.
 pub(crate) struct SinkRules<'a> {
@@ -88,6 +90,7 @@ struct PendingRows {
     vectors: Vec<VectorColumn>,
     pictures: Vec<Vec<Picture>>,
     picture_valid: Vec<Vec<bool>>,
+    picture_bytes: usize,
     ages: AgeColumns,
 }
 
@@ -248,7 +251,9 @@ impl RowSink<Picture> for EpisodeSink<'_> {
             }
         }
         open.rows.push(row, rules.schema);
-        if open.rows.time_ns.len() >= PIECE_ROWS && self.error.is_none() {
+        if (open.rows.time_ns.len() >= PIECE_ROWS || open.rows.picture_bytes >= PIECE_BYTES)
+            && self.error.is_none()
+        {
             let result = self.flush(false);
             self.keep_error(result);
         }
@@ -283,6 +288,7 @@ impl PendingRows {
         for (feature, &valid) in schema.features.iter().zip(&row.valid) {
             let width = feature.width();
             if feature.role == Role::Image || width == 0 {
+                self.picture_bytes += row.images[image].held_bytes();
                 self.pictures[image].push(row.images[image].clone());
                 self.picture_valid[image].push(valid);
                 image += 1;

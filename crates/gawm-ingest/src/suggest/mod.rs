@@ -3,7 +3,9 @@
 //! [`suggest`] looks at the logs ([`survey`]), decides what each topic is ([`guess`]), measures how commands and
 //! states hang together ([`measure`], [`lag`]) and writes the contract with comments ([`render`]).
 
+mod clock;
 mod episodes;
+mod fields;
 mod guess;
 mod lag;
 mod measure;

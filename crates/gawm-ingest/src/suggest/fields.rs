@@ -1,0 +1,320 @@
+//! Which numbers of a message are columns, and what they are.
+
+use serde_json::Value;
+
+use super::guess::Group;
+use super::survey::{Survey, Topic};
+use super::{names, urdf};
+use crate::contract::KindSpec;
+use crate::decode::{FieldInfo, Scalar};
+
+/// Widest feature that one topic may give.
+const MAX_WIDTH: usize = 1024;
+
+/// How a message pairs the names of joints with their positions.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum JointLayout<'a> {
+    /// Two arrays.
+    Parallel { key: &'static str, value: &'static str },
+    /// An array of structs with `name` and `position`.
+    Structs { list: &'a str },
+}
+
+fn joint_layout(topic: &Topic) -> Option<JointLayout<'_>> {
+    let has = |path: &str| topic.fields.iter().any(|field| field.path == path);
+    let parallel =
+        [("name", "position"), ("joint_names", "positions"), ("names", "positions"), ("name", "positions")];
+    if let Some((key, value)) =
+        parallel.into_iter().find(|(key, value)| has(&format!("{key}[]")) && has(&format!("{value}[]")))
+    {
+        return Some(JointLayout::Parallel { key, value });
+    }
+    topic.fields.iter().find_map(|field| {
+        let list = field.path.strip_suffix("[].name")?;
+        let is_plain = !list.contains(['.', '[']) && has(&format!("{list}[].position"));
+        is_plain.then_some(JointLayout::Structs { list })
+    })
+}
+
+/// Joint positions by name, when the message has parallel `name` and `position` arrays.
+pub(crate) fn joints(topic: &Topic, messages: &[Value], survey: &Survey) -> Option<Vec<Group>> {
+    let layout = joint_layout(topic)?;
+    let names_of = |message: &Value| -> Option<Vec<String>> {
+        let texts =
+            |items: &[Value]| items.iter().filter_map(|name| name.as_str().map(str::to_owned)).collect();
+        let names: Vec<String> = match layout {
+            JointLayout::Parallel { key, value } => {
+                let names = message.get(key)?.as_array()?;
+                let values = message.get(value)?.as_array()?;
+                if names.len() == values.len() { texts(names) } else { return None }
+            }
+            JointLayout::Structs { list } => message
+                .get(list)?
+                .as_array()?
+                .iter()
+                .filter_map(|item| Some(item.get("name")?.as_str()?.to_owned()))
+                .collect(),
+        };
+        (!names.is_empty()).then_some(names)
+    };
+    let all: Vec<Vec<String>> = messages.iter().filter_map(names_of).collect();
+    let first = all.first()?;
+    let mut common: Vec<String> =
+        first.iter().filter(|name| all.iter().all(|names| names.contains(name))).cloned().collect();
+    common.dedup();
+    let mut unique = common.clone();
+    unique.sort();
+    unique.dedup();
+    if common.is_empty() || unique.len() != common.len() {
+        return None;
+    }
+    let (known, order) = urdf::joints(&survey.urdf);
+    let is_shuffled = all.iter().any(|names| names != first);
+    if common.iter().all(|name| order.contains(name)) {
+        common.sort_by_key(|name| order.iter().position(|other| other == name));
+    } else if is_shuffled {
+        common = unique;
+    }
+    let mut groups: Vec<Group> = Vec::new();
+    for name in common {
+        let joint = known.get(&name);
+        let (kind, unit, reason) = match joint.map(|joint| joint.kind.as_str()) {
+            Some("prismatic") if names::is_gripper(&name) => {
+                (KindSpec::Gripper, "m", "prismatic in the URDF, and named as a gripper")
+            }
+            Some("prismatic") => (KindSpec::Linear, "m", "prismatic in the URDF"),
+            Some(_) => (KindSpec::Angle, "rad", "revolute or continuous in the URDF"),
+            None if names::is_gripper(&name) => {
+                (KindSpec::Gripper, "m", "named as a gripper; no URDF says its unit")
+            }
+            None => {
+                (KindSpec::Angle, "rad", "positions of joints are angles in rad unless a URDF says otherwise")
+            }
+        };
+        let limits = joint.and_then(|joint| joint.limits);
+        let quoted = name.replace('\\', "\\\\").replace('"', "\\\"");
+        let field = match layout {
+            JointLayout::Parallel { key, value } => format!("{value}[{key}=\"{quoted}\"]"),
+            JointLayout::Structs { list } => format!("{list}[name=\"{quoted}\"].position"),
+        };
+        let is_same = groups.last().is_some_and(|group| {
+            group.kind == kind && group.reason == reason && group.limits.is_empty() == limits.is_none()
+        });
+        match groups.last_mut().filter(|_| is_same) {
+            Some(group) => {
+                group.fields.push(field);
+                group.limits.extend(limits);
+            }
+            None => groups.push(Group {
+                fields: vec![field],
+                kind,
+                unit: Some(unit.to_owned()),
+                limits: limits.into_iter().collect(),
+                reason: reason.to_owned(),
+                is_joints: true,
+            }),
+        }
+    }
+    Some(groups)
+}
+
+/// All numbers of a message that is no joint state: quaternions as such, arrays where their length is fixed.
+pub(crate) fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
+    let mut groups: Vec<Group> = Vec::new();
+    let mut width = 0;
+    let fields: Vec<&FieldInfo> = topic
+        .fields
+        .iter()
+        .filter(|field| field.scalar.is_some_and(|scalar| scalar != Scalar::Text))
+        .filter(|field| !names::is_bookkeeping(&field.path))
+        .collect();
+    let mut at = 0;
+    while at < fields.len() {
+        let field = fields[at];
+        if let Some((order, paths)) = quaternion_at(&fields[at..]) {
+            groups.push(Group {
+                fields: paths,
+                kind: KindSpec::Quaternion,
+                unit: None,
+                limits: Vec::new(),
+                reason: format!("four numbers named x, y, z, w: a quaternion in {order} order"),
+                is_joints: false,
+            });
+            at += 4;
+            width += 4;
+            continue;
+        }
+        at += 1;
+        let Some(expanded) = fixed_path(field, messages) else { continue };
+        let (path, n) = expanded;
+        width += n;
+        if width > MAX_WIDTH {
+            break;
+        }
+        let (kind, unit, reason) = kind_of(topic, field);
+        match groups
+            .last_mut()
+            .filter(|group| group.kind == kind && group.unit == unit && group.reason == reason)
+        {
+            Some(group) => group.fields.push(path),
+            None => groups.push(Group {
+                fields: vec![path],
+                kind,
+                unit,
+                limits: Vec::new(),
+                reason,
+                is_joints: false,
+            }),
+        }
+    }
+    // A single text that holds JSON: its numbers, when all samples have them.
+    if groups.is_empty() {
+        groups.extend(json_in_text(topic, messages));
+    }
+    groups
+}
+
+fn quaternion_at(fields: &[&FieldInfo]) -> Option<(&'static str, Vec<String>)> {
+    let four = fields.get(..4)?;
+    let parent = four[0].path.rsplit_once('.')?.0;
+    if parent.contains("[]") {
+        return None;
+    }
+    let mut leaves = Vec::new();
+    for field in four {
+        let (other, leaf) = field.path.rsplit_once('.')?;
+        if other != parent {
+            return None;
+        }
+        leaves.push(leaf);
+    }
+    let order = match leaves.as_slice() {
+        ["x", "y", "z", "w"] => "xyzw",
+        ["w", "x", "y", "z"] => "wxyz",
+        _ => return None,
+    };
+    Some((order, four.iter().map(|field| field.path.clone()).collect()))
+}
+
+/// Returns the path of a leaf that every message has, arrays of equal length as slices, and its number of values.
+fn fixed_path(field: &FieldInfo, messages: &[Value]) -> Option<(String, usize)> {
+    match field.arrays.as_slice() {
+        [] => {
+            let n = messages
+                .iter()
+                .filter(|message| is_number(crate::episodes::value_at(message, &field.path).as_ref()))
+                .count();
+            is_most(n, messages.len()).then(|| (field.path.clone(), 1))
+        }
+        [_] if field.path.ends_with("[]") => {
+            let base = field.path.trim_end_matches("[]");
+            let lengths: Vec<Option<usize>> = messages
+                .iter()
+                .map(|message| {
+                    let items = crate::episodes::value_at(message, base)?;
+                    let items = items.as_array()?;
+                    items.iter().all(|item| is_number(Some(item))).then_some(items.len())
+                })
+                .collect();
+            let n = lengths
+                .iter()
+                .flatten()
+                .max_by_key(|n| lengths.iter().filter(|other| **other == Some(**n)).count())?;
+            let same = lengths.iter().filter(|length| **length == Some(*n)).count();
+            (*n > 0 && *n <= MAX_WIDTH && is_most(same, lengths.len()))
+                .then(|| (format!("{base}[0:{n}]"), *n))
+        }
+        _ => None,
+    }
+}
+
+/// A few damaged messages do not decide what a topic is.
+fn is_most(n: usize, all: usize) -> bool {
+    n > 0 && 10 * n >= 8 * all
+}
+
+/// Numbers, truth values, and the texts that stand for numbers which JSON does not have.
+fn is_number(value: Option<&Value>) -> bool {
+    match value {
+        Some(Value::Number(_) | Value::Bool(_)) => true,
+        Some(Value::String(text)) => matches!(text.as_str(), "NaN" | "Infinity" | "-Infinity"),
+        _ => false,
+    }
+}
+
+fn kind_of(topic: &Topic, field: &FieldInfo) -> (KindSpec, Option<String>, String) {
+    let some = |unit: &str| Some(unit.to_owned());
+    let words = super::names::words(&field.path);
+    let has = |word: &str| words.iter().any(|other| other == word);
+    if field.scalar == Some(Scalar::Bool) {
+        return (KindSpec::Bool, None, "truth values".to_owned());
+    }
+    if names::is_gripper(&field.path) || names::is_gripper(&topic.channel.topic) {
+        let unit = if field.path.ends_with("_m") {
+            some("m")
+        } else if field.path.ends_with("_n") {
+            some("N")
+        } else {
+            None
+        };
+        if unit.as_deref() != Some("N") {
+            return (KindSpec::Gripper, unit, "named as a gripper".to_owned());
+        }
+        return (KindSpec::Linear, unit, "a force by its name".to_owned());
+    }
+    let bare = topic.type_name().rsplit(['/', '.']).next().unwrap_or("");
+    if has("rotvec") || names::words(&topic.channel.topic).iter().any(|word| word == "rotvec") {
+        return (KindSpec::Rotvec, some("rad"), "a rotation vector by its name".to_owned());
+    }
+    let is_pose = field.owner.ends_with("Point") || has("position") || has("translation");
+    let unit = match () {
+        () if has("angular") && (has("velocity") || bare.starts_with("Twist") || has("twist")) => {
+            some("rad/s")
+        }
+        () if has("acceleration") => some("m/s^2"),
+        () if has("linear") && (has("velocity") || bare.starts_with("Twist") || has("twist")) => some("m/s"),
+        () if is_pose && field.path.ends_with(['x', 'y', 'z']) => some("m"),
+        () if has("angle") && !has("velocity") => {
+            return (KindSpec::Angle, some("rad"), "an angle by its name".to_owned());
+        }
+        () if field.path.ends_with("_rad") => {
+            return (KindSpec::Angle, some("rad"), "an angle by its name".to_owned());
+        }
+        () if field.path.ends_with("_deg") => {
+            return (KindSpec::Angle, some("deg"), "an angle by its name".to_owned());
+        }
+        () if field.path.ends_with("_m") => some("m"),
+        () => None,
+    };
+    let reason =
+        if unit.is_some() { "unit by type and name" } else { "unit unknown: say `unit` if you know it" };
+    (KindSpec::Linear, unit, reason.to_owned())
+}
+
+fn json_in_text(topic: &Topic, messages: &[Value]) -> Option<Group> {
+    let text_field =
+        topic.fields.iter().find(|field| field.scalar == Some(Scalar::Text) && field.arrays.is_empty())?;
+    let parse = |message: &Value| -> Option<Value> {
+        let text = crate::episodes::value_at(message, &text_field.path)?;
+        serde_json::from_str(text.as_str()?).ok()
+    };
+    let inner: Option<Vec<Value>> = messages.iter().map(parse).collect();
+    let inner = inner?;
+    let first = inner.first()?.as_object()?;
+    let mut fields = Vec::new();
+    for (name, value) in first {
+        let is_plain = name.chars().all(|c| c.is_alphanumeric() || c == '_');
+        let is_always =
+            inner.iter().all(|other| other.get(name).is_some_and(|v| v.is_number() || v.is_boolean()));
+        if is_plain && is_always && value.is_number() && !names::is_bookkeeping(name) {
+            fields.push(format!("{}.{name}", text_field.path));
+        }
+    }
+    let is_event = ["event", "state", "type"].iter().any(|key| first.get(*key).is_some_and(Value::is_string));
+    if fields.is_empty() || is_event {
+        return None;
+    }
+    let reason = "numbers of the JSON that the text holds".to_owned();
+    let kind = if names::is_gripper(&topic.channel.topic) { KindSpec::Gripper } else { KindSpec::Linear };
+    Some(Group { fields, kind, unit: None, limits: Vec::new(), reason, is_joints: false })
+}
