@@ -1,5 +1,5 @@
 //! What the end-to-end tests share: the program, its outputs, the corpora.
-#![expect(dead_code, reason = "each test file uses a part")]
+#![allow(dead_code, unreachable_pub, reason = "each test program uses a part")]
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
