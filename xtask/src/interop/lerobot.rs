@@ -37,7 +37,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let mut is_good = true;
     for dataset in &datasets {
         let output = Command::new(&interpreter)
-            .arg(root().join("xtask/interop/lerobot.py"))
+            .arg(root().join("xtask/interop/check_lerobot.py"))
             .arg(dataset)
             .output()
             .with_context(|| format!("cannot run {}", interpreter.display()))?;
