@@ -190,6 +190,8 @@ impl Dataset {
         let at = names
             .iter()
             .position(|name| name == dim)
+            // A joint picked by name from a list of structs is named after the list too: `joint_1.joints`.
+            .or_else(|| names.iter().position(|name| name.split('.').next() == Some(dim)))
             .unwrap_or_else(|| panic!("{dim:?} is not in {names:?}"));
         let mut out = Vec::new();
         for batch in &self.batches {
