@@ -1,5 +1,7 @@
 //! `gawm-ingest` from the outside: what a user types, what comes back, what lies on disk.
 
+#![expect(clippy::unwrap_used, reason = "a test that lacks what it needs has failed")]
+
 mod support;
 
 use std::path::{Path, PathBuf};

@@ -1,5 +1,7 @@
 //! `gawm-ingest` on the corpora: exact against their truth files, defined outcomes for every damage.
 
+#![expect(clippy::unwrap_used, reason = "a test that lacks what it needs has failed")]
+
 mod support;
 
 use std::path::{Path, PathBuf};

@@ -17,6 +17,9 @@ use crate::episode::FeatureStats;
 pub struct CameraStats {
     /// Frames that were counted.
     pub frames: u64,
+    /// Whether the pixels are floats, counted as whole thousandths (metres as millimetres).
+    #[serde(default)]
+    pub has_thousandths: bool,
     /// Per channel how often each pixel value occurs.
     pub channels: Vec<BTreeMap<u16, u64>>,
 }
@@ -31,6 +34,7 @@ impl CameraStats {
     /// Takes what other frames gave.
     pub fn merge(&mut self, other: &CameraStats) {
         self.frames += other.frames;
+        self.has_thousandths |= other.has_thousandths;
         if self.channels.len() < other.channels.len() {
             self.channels.resize(other.channels.len(), BTreeMap::new());
         }
@@ -43,6 +47,7 @@ impl CameraStats {
 
     /// Returns LeRobot's statistics: three channels, values times `unit`; zeros when no frame was counted.
     pub(crate) fn feature_stats(&self, unit: f64) -> FeatureStats {
+        let unit = if self.has_thousandths { 1e-3 } else { unit };
         let empty = BTreeMap::new();
         let mut stats = FeatureStats { count: self.frames, ..FeatureStats::default() };
         for channel in 0..3 {
@@ -133,6 +138,7 @@ fn count_pixels(image: &Image) -> CameraStats {
     let (height, width, channels) =
         (image.height() as usize, image.width() as usize, image.pixels().channels());
     let step = (height.max(width) / 256).max(1);
+    let has_thousandths = matches!(image.pixels(), Pixels::GrayF32(_));
     let mut dense = vec![vec![0u64; 1 << 16]; channels.min(3)];
     for y in (0..height).step_by(step) {
         for x in (0..width).step_by(step) {
@@ -153,5 +159,5 @@ fn count_pixels(image: &Image) -> CameraStats {
         let filled = counts.into_iter().enumerate().filter(|(_, count)| *count > 0);
         filled.map(|(value, count)| (value as u16, count)).collect()
     };
-    CameraStats { frames: 1, channels: dense.into_iter().map(sparse).collect() }
+    CameraStats { frames: 1, has_thousandths, channels: dense.into_iter().map(sparse).collect() }
 }

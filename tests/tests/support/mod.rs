@@ -1,5 +1,5 @@
 //! What the end-to-end tests share: the program, its outputs, the corpora.
-#![expect(dead_code, reason = "each test file uses a part")]
+#![allow(dead_code, unreachable_pub, reason = "each test program uses a part")]
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -46,9 +46,9 @@ pub fn program() -> &'static Path {
         let tests = std::env::current_exe().unwrap();
         let folder = tests.parent().and_then(Path::parent).unwrap().to_owned();
         let mut build = Command::new(env!("CARGO"));
-        build
-            .args(["build", "--quiet", "--package", "gawm-ingest", "--bin", "gawm-ingest"])
-            .current_dir(root());
+        // The whole workspace with its tests has the features that the running test was built with: only the program
+        // is left to link. One package alone would build its dependencies again with fewer.
+        build.args(["build", "--quiet", "--workspace", "--tests", "--bins"]).current_dir(root());
         build.arg("--target-dir").arg(folder.parent().unwrap());
         if folder.ends_with("release") {
             build.arg("--release");

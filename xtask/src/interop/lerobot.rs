@@ -31,12 +31,13 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
             python::environment(&folder.join("venv"), &requirements, &[])?
         }
     };
-    let datasets = if arguments.datasets.is_empty() { ingest_fixtures(&folder)? } else { arguments.datasets.clone() };
+    let datasets =
+        if arguments.datasets.is_empty() { ingest_fixtures(&folder)? } else { arguments.datasets.clone() };
     let mut text = String::from("Command: `cargo xtask interop lerobot`.\n");
     let mut is_good = true;
     for dataset in &datasets {
         let output = Command::new(&interpreter)
-            .arg(root().join("xtask/interop/lerobot.py"))
+            .arg(root().join("xtask/interop/check_lerobot.py"))
             .arg(dataset)
             .output()
             .with_context(|| format!("cannot run {}", interpreter.display()))?;
@@ -64,7 +65,18 @@ fn ingest_fixtures(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
             std::fs::remove_dir_all(&out).with_context(|| format!("cannot remove {}", out.display()))?;
         }
         let status = Command::new(&cargo)
-            .args(["run", "--release", "--quiet", "-p", "gawm-ingest", "--", "run", "--config", contract, "--out"])
+            .args([
+                "run",
+                "--release",
+                "--quiet",
+                "-p",
+                "gawm-ingest",
+                "--",
+                "run",
+                "--config",
+                contract,
+                "--out",
+            ])
             .arg(&out)
             .arg(log)
             .current_dir(root())

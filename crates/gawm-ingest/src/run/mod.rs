@@ -1,7 +1,7 @@
 //! From logs and a contract to a dataset.
 //!
-//! Blocks of a log are read and decoded by worker threads ([`block`], [`prefetch`]) and consumed in order by one
-//! [`session`], which sorts, counts and aligns; the [`sink`] writes episodes. Nothing depends on the number of threads.
+//! Blocks of a log are read and decoded by worker threads (`block`, `prefetch`) and consumed in order by one
+//! `session`, which sorts, counts and aligns; the `sink` writes episodes. Nothing depends on the number of threads.
 
 mod bind;
 mod block;

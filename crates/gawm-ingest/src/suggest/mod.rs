@@ -1,7 +1,7 @@
 //! Writes a first contract from logs, every guess with its reason.
 //!
-//! [`suggest`] looks at the logs ([`survey`]), decides what each topic is ([`guess`]), measures how commands and
-//! states hang together ([`measure`], [`lag`]) and writes the contract with comments ([`render`]).
+//! [`suggest`] looks at the logs (`survey`), decides what each topic is (`guess`), measures how commands and
+//! states hang together (`measure`, `lag`) and writes the contract with comments (`render`).
 
 mod clock;
 mod episodes;

@@ -1,6 +1,6 @@
 """Opens a gawm dataset with the published `lerobot` and compares what it hands out with the Parquet files themselves.
 
-    python lerobot.py DATASET_DIR
+    python check_lerobot.py DATASET_DIR
 
 Prints one line per check; exits 0 when all hold. Offline: nothing is fetched, nothing is written into the dataset.
 """
