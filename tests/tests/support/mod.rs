@@ -4,7 +4,6 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
-use std::sync::OnceLock;
 
 use arrow::array::{Array, AsArray, RecordBatch};
 use arrow::datatypes::{Float64Type, Int64Type};
@@ -39,23 +38,9 @@ pub fn shared() -> Option<PathBuf> {
     Some(path.join("corpora"))
 }
 
-/// The program, built once per test run in the profile of the tests.
+/// The program: a `main` of this package over the same `cli` module, so that cargo has built it with the tests.
 pub fn program() -> &'static Path {
-    static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
-    PROGRAM.get_or_init(|| {
-        let tests = std::env::current_exe().unwrap();
-        let folder = tests.parent().and_then(Path::parent).unwrap().to_owned();
-        let mut build = Command::new(env!("CARGO"));
-        // The whole workspace with its tests has the features that the running test was built with: only the program
-        // is left to link. One package alone would build its dependencies again with fewer.
-        build.args(["build", "--quiet", "--workspace", "--tests", "--bins"]).current_dir(root());
-        build.arg("--target-dir").arg(folder.parent().unwrap());
-        if folder.ends_with("release") {
-            build.arg("--release");
-        }
-        assert!(build.status().unwrap().success(), "gawm-ingest does not build");
-        folder.join("gawm-ingest")
-    })
+    Path::new(env!("CARGO_BIN_EXE_e2e-gawm-ingest"))
 }
 
 /// Runs the program.

@@ -167,6 +167,10 @@ pub(crate) fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
             }),
         }
     }
+    for group in groups.iter_mut().filter(|group| group.kind == KindSpec::Rotvec && group.fields.len() % 3 != 0) {
+        group.kind = KindSpec::Linear;
+        "no three numbers of a rotation vector".clone_into(&mut group.reason);
+    }
     // A single text that holds JSON: its numbers, when all samples have them.
     if groups.is_empty() {
         groups.extend(json_in_text(topic, messages));
