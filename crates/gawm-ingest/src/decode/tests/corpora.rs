@@ -125,7 +125,6 @@ fn every_channel_decodes_or_says_why_not() {
 
 /// A column of a truth file.
 struct Truth {
-    shape: Vec<u64>,
     bytes: Vec<u8>,
 }
 
@@ -138,10 +137,10 @@ impl Truth {
             let name = file.name().unwrap().trim_end_matches(".npy").to_owned();
             let mut raw = Vec::new();
             file.read_to_end(&mut raw).unwrap();
-            let npy = npyz::NpyFile::new(&raw[..]).unwrap();
-            let shape = npy.shape().to_vec();
+            // Version 1.0: the length of the header stands behind the magic and the version.
+            assert_eq!(raw[..8], *b"\x93NUMPY\x01\0", "{name}");
             let header = 10 + usize::from(u16::from_le_bytes([raw[8], raw[9]]));
-            out.insert(name, Self { shape, bytes: raw[header..].to_vec() });
+            out.insert(name, Self { bytes: raw[header..].to_vec() });
         }
         out
     }
@@ -282,7 +281,7 @@ fn cell_log_equals_its_truth() {
     let fields: Vec<String> =
         frames.iter().map(|f| format!("transforms[child_frame_id=\"{f}\"].transform")).collect();
     check("/tf", &fields.iter().map(String::as_str).collect::<Vec<_>>(), "tf", Some("tf_stamp"));
-    assert_eq!(truth["tf"].shape, [600, 4, 7]);
+    assert_eq!(truth["tf"].bytes.len(), 600 * 4 * 7 * 8);
 }
 
 /// Takes the images of one topic out of a log.
