@@ -51,6 +51,8 @@ pub(crate) struct EncodedPlan {
     pub(crate) encoder: Encoder,
     /// Position among the vectors and width of each feature that is read.
     pub(crate) inputs: Vec<(usize, usize)>,
+    /// Per dim the vector and dim that store the same bits: a float32 value that is encoded as it is.
+    pub(crate) same_as: Vec<Option<(usize, usize)>>,
 }
 
 impl VectorPlan {
@@ -71,7 +73,8 @@ impl Columns {
             .filter_map(|(name, role)| {
                 let encoder = Encoder::new(schema, role)?;
                 let inputs = vector_positions(schema, &encoder);
-                Some(EncodedPlan { name, encoder, inputs })
+                let same_as = same_dims(&vectors, &encoder, &inputs);
+                Some(EncodedPlan { name, encoder, inputs, same_as })
             })
             .collect();
         let valid_names =
@@ -202,6 +205,22 @@ pub(crate) fn numeric_properties() -> parquet::file::properties::WriterPropertie
         .set_dictionary_enabled(false)
         .set_max_row_group_row_count(None)
         .set_statistics_enabled(EnabledStatistics::Chunk)
+}
+
+/// Returns for each encoded dim the raw dim that stores the same bits.
+fn same_dims(
+    vectors: &[VectorPlan],
+    encoder: &Encoder,
+    inputs: &[(usize, usize)],
+) -> Vec<Option<(usize, usize)>> {
+    let same = |dim: &gawm_schema::EncodedDim| {
+        let vector = inputs.iter().map(|&(vector, _)| vector).find(|&v| vectors[v].name == dim.feature)?;
+        let plan = &vectors[vector];
+        let is_same = dim.encoding == gawm_schema::Encoding::Identity && plan.dtype == FloatType::Float32;
+        let position = plan.dim_names.iter().position(|name| Some(name) == dim.raw_dims.first())?;
+        is_same.then_some((vector, position))
+    };
+    encoder.dims().iter().map(same).collect()
 }
 
 /// Returns the nearest whole number of frames per second, at least 1.

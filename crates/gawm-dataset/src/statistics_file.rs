@@ -48,7 +48,7 @@ impl StatisticsFile {
         let names = column_dims(columns);
         let by_column = names
             .into_iter()
-            .zip(&totals.dims)
+            .zip(&totals.completed(columns))
             .map(|((column, dims), stats)| {
                 let entries = dims.into_iter().zip(stats).map(|(name, stats)| dim_statistics(name, stats));
                 (column, entries.collect())
@@ -58,7 +58,7 @@ impl StatisticsFile {
     }
 }
 
-/// Returns name and dim names of each column with statistics, in the order of [`Totals::dims`].
+/// Returns name and dim names of each column with statistics, in the order of [`Totals::completed`].
 fn column_dims(columns: &Columns) -> Vec<(String, Vec<String>)> {
     let vectors = columns.vectors.iter().map(|v| (v.name.clone(), v.dim_names.clone()));
     let encoded = columns
@@ -85,7 +85,7 @@ pub(crate) fn lerobot_stats(
     cameras: &BTreeMap<String, CameraStats>,
 ) -> Value {
     let mut features = serde_json::Map::new();
-    for ((name, _), dims) in column_dims(columns).into_iter().zip(&totals.dims) {
+    for ((name, _), dims) in column_dims(columns).into_iter().zip(&totals.completed(columns)) {
         let summaries: Vec<DimSummary> = dims.iter().map(DimStats::summary).collect();
         features.insert(name, stats_json(&FeatureStats::of(&summaries), |v| json!(v)));
     }

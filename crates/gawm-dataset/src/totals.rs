@@ -10,7 +10,8 @@ use crate::columns::Columns;
 /// that appended, resumed and undisturbed runs give the same bits.
 #[derive(Debug, Clone)]
 pub(crate) struct Totals {
-    /// Per vector feature, then per encoded column: per dim.
+    /// Per vector feature, then per encoded column: per dim. Encoded dims that store the same bits as a raw dim are
+    /// not counted; [`Totals::completed`] has them.
     pub(crate) dims: Vec<Vec<DimStats>>,
     /// Per encoded column and dim: moments of rows with valid features in training episodes.
     pub(crate) training: Vec<Vec<Moments>>,
@@ -46,12 +47,21 @@ impl Totals {
             .zip(columns.vectors.iter().map(|v| v.width()))
             .chain(block.encoded.iter().zip(columns.encoded.iter().map(|e| e.encoder.width())))
             .collect();
+        let n_vectors = columns.vectors.len();
         let n_values: usize = stored.iter().map(|(_, width)| width * block.len()).sum();
         let tasks: Vec<(&StoredValues, usize, usize, &mut DimStats)> = stored
             .iter()
             .zip(&mut self.dims)
-            .flat_map(|(&(values, width), stats)| {
-                stats.iter_mut().enumerate().map(move |(dim, stats)| (values, width, dim, stats))
+            .enumerate()
+            .flat_map(|(column, (&(values, width), stats))| {
+                let is_counted = move |dim: usize| {
+                    column.checked_sub(n_vectors).is_none_or(|e| columns.encoded[e].same_as[dim].is_none())
+                };
+                stats
+                    .iter_mut()
+                    .enumerate()
+                    .filter(move |(dim, _)| is_counted(*dim))
+                    .map(move |(dim, stats)| (values, width, dim, stats))
             })
             .collect();
         let count = |(values, width, dim, stats): (&StoredValues, usize, usize, &mut DimStats)| {
@@ -80,6 +90,20 @@ impl Totals {
                     .for_each(|(value, _)| moments.update(*value));
             }
         }
+    }
+
+    /// Returns the statistics of all columns: per vector feature, then per encoded column.
+    pub(crate) fn completed(&self, columns: &Columns) -> Vec<Vec<DimStats>> {
+        let mut dims = self.dims.clone();
+        let (vectors, encoded) = dims.split_at_mut(columns.vectors.len());
+        for (plan, stats) in columns.encoded.iter().zip(encoded) {
+            for (same, stats) in plan.same_as.iter().zip(stats) {
+                if let Some((vector, dim)) = *same {
+                    *stats = DimStats { circular: None, ..vectors[vector][dim].clone() };
+                }
+            }
+        }
+        dims
     }
 
     /// Marks everything counted so far as one episode.

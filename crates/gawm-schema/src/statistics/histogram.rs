@@ -32,6 +32,9 @@ impl Histogram {
         }
         if finest > self.exponent {
             self.widen(finest);
+        } else if let Some(count) = self.count_mut(bin_of(value, self.exponent)) {
+            *count += 1;
+            return;
         }
         let mut bin = bin_of(value, self.exponent);
         while self.span_with(bin, bin) > Self::MAX_BINS as i128 {
@@ -78,6 +81,11 @@ impl Histogram {
     /// Returns the counts; the first and the last bin are not empty.
     pub fn counts(&self) -> &[u64] {
         &self.counts
+    }
+
+    /// Returns the count of a bin between the first and the last.
+    fn count_mut(&mut self, bin: i64) -> Option<&mut u64> {
+        usize::try_from(bin - self.first).ok().and_then(|position| self.counts.get_mut(position))
     }
 
     fn last(&self) -> i64 {
@@ -131,7 +139,9 @@ fn finest_exponent(value: f64) -> i32 {
 }
 
 fn bin_of(value: f64, exponent: i32) -> i64 {
-    // Two steps, since 2^1000 times a subnormal width would overflow in one.
-    let half = exponent / 2;
-    (value * 2f64.powi(-half) * 2f64.powi(half - exponent)).floor() as i64
+    // 2^-exponent, built from its bits: exponents lie in -1000..=984, so that it is a normal number.
+    let inverse_width = f64::from_bits(((1023 - i64::from(exponent)) as u64) << 52);
+    let bin = (value * inverse_width).floor() as i64;
+    // A negative value so small that the product vanishes still lies left of 0.
+    if bin == 0 && value < 0.0 { -1 } else { bin }
 }

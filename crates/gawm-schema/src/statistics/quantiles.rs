@@ -11,11 +11,13 @@ pub struct QuantileSketch {
     /// `levels[h]` holds values of weight 2^h; level 0 in order of arrival.
     levels: Vec<Vec<f64>>,
     flips: u64,
+    /// Capacity of level 0.
+    room: usize,
 }
 
 impl Default for QuantileSketch {
     fn default() -> Self {
-        QuantileSketch { count: 0, levels: vec![Vec::new()], flips: 0 }
+        QuantileSketch { count: 0, levels: vec![Vec::new()], flips: 0, room: Self::EXACT }
     }
 }
 
@@ -31,7 +33,7 @@ impl QuantileSketch {
     pub fn update(&mut self, value: f64) {
         self.levels[0].push(value);
         self.count += 1;
-        if self.levels[0].len() > self.capacity(0) {
+        if self.levels[0].len() > self.room {
             self.compress();
         }
     }
@@ -106,6 +108,7 @@ impl QuantileSketch {
             self.levels[height + 1].extend(values.iter().skip(offset).step_by(2));
             self.levels[height].extend(kept);
         }
+        self.room = self.capacity(0);
     }
 
     /// Returns a fair coin: a bit of the SplitMix64 sequence.
