@@ -1,0 +1,3 @@
+//! Planners, the evaluation harness, diagnostics and figures.
+
+#![forbid(unsafe_code)]

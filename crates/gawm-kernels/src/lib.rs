@@ -1,0 +1,2 @@
+//! Fused operations with exact backward: pure slice functions under thin candle adapters.
+

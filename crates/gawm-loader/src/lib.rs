@@ -1,0 +1,2 @@
+//! Samples clips from datasets and decodes them straight into shared-memory slots.
+

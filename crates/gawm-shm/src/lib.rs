@@ -1,0 +1,2 @@
+//! Batches between processes in fixed-layout shared-memory slots (iceoryx2).
+
