@@ -63,8 +63,9 @@ fn read(suggestion: &Suggestion, survey: &Survey, library: &SchemaLibrary) -> Op
     let plans = Plans::new(&binding, &[], &[], library);
     let mut all: StreamSeries = BTreeMap::new();
     let _: ControlFlow<()> = survey.first.read(&plans, 1, |_, block| {
-        for message in block.messages.iter().filter(|message| message.loss.is_none()) {
-            for (group, (range, stamp_ns)) in plans.topics[message.topic].groups.iter().zip(&message.rows) {
+        for message in block.messages.iter().filter(|message| message.loss().is_none()) {
+            let rows = message.rows(&block.rows);
+            for (group, (range, stamp_ns)) in plans.topics[message.topic].groups.iter().zip(rows) {
                 if range.is_empty() {
                     continue;
                 }

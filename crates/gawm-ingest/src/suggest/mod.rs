@@ -12,6 +12,7 @@ mod lag;
 mod measure;
 mod names;
 mod render;
+mod stream_names;
 mod survey;
 mod urdf;
 
@@ -90,6 +91,7 @@ pub fn suggest(
     }
     measure::refine(&mut suggestion, &survey, library);
     episodes::guess(&mut suggestion, &survey);
+    stream_names::name_streams(&mut suggestion.contract);
     Ok(suggestion)
 }
 
