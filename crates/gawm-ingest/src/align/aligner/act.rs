@@ -20,6 +20,10 @@ impl<I: Clone> Aligner<I> {
                     let (now, then) = (&row.values[range.clone()], &next.values[range]);
                     action::derived(*derivation, parts, now, then, &mut values);
                     row.valid[index] = row.valid[*from] && next.valid[*from];
+                    if !row.valid[index] {
+                        // The next state may be one without this one being one; such an action is none.
+                        values[start..].fill(f64::NAN);
+                    }
                     actions.extend_from_slice(&values[start..]);
                 }
                 FeatureRule::Vector { streams } => {
