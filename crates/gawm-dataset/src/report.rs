@@ -65,7 +65,7 @@ pub fn render_report(dataset: &Dataset, options: ReportOptions) -> Result<String
 }
 
 /// Makes text safe inside HTML and its attributes.
-fn escape(text: &str) -> String {
+pub(crate) fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         match c {

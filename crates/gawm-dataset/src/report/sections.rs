@@ -3,10 +3,10 @@
 use std::{collections::BTreeMap, fmt::Write};
 
 use base64::Engine;
+use gawm_image::{Limits, decode_thumbnail, encode_jpeg};
 
 use super::{Material, chart, escape};
 use crate::{
-    picture,
     read::FrameBytes,
     validate::{Finding, Severity, rule},
 };
@@ -414,12 +414,12 @@ fn skew(material: &Material<'_>, page: &mut String) {
 /// Returns a frame as a small picture inside the page.
 fn embedded(frame: &FrameBytes) -> Option<String> {
     let FrameBytes::Encoded(bytes) = frame else { return None };
-    let (_, picture) = picture::decode(bytes, FRAME_WIDTH / 2).ok()?;
+    let (_, picture) = decode_thumbnail(bytes, FRAME_WIDTH / 2, &Limits::default()).ok()?;
     let small = if picture.width > FRAME_WIDTH {
         picture.shrunk(FRAME_WIDTH, (picture.height * FRAME_WIDTH / picture.width).max(1))
     } else {
         picture
     };
-    let jpeg = small.to_jpeg().ok()?;
+    let jpeg = encode_jpeg(&small.to_image().ok()?, 75).ok()?;
     Some(format!("data:image/jpeg;base64,{}", base64::engine::general_purpose::STANDARD.encode(jpeg)))
 }
