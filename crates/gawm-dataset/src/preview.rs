@@ -21,6 +21,9 @@ const TRACE_POINTS: usize = 640;
 /// Dims drawn of one column.
 const MAX_DIMS: usize = 12;
 
+/// What stands in the place of a frame in a video file.
+const IN_VIDEO: &str = "in a video";
+
 /// Colours of dims, to be told apart on light and dark.
 const COLOURS: [[u8; 3]; MAX_DIMS] = [
     [31, 119, 180],
@@ -228,7 +231,7 @@ fn frames_of(
     is_in_files: bool,
 ) -> Vec<(usize, Result<Thumbnail, String>)> {
     if !is_in_files {
-        return rows.iter().map(|row| (*row, Err("in a video".to_owned()))).collect();
+        return rows.iter().map(|row| (*row, Err(IN_VIDEO.to_owned()))).collect();
     }
     let frames = match dataset.read_frames(run_index, camera, rows) {
         Ok(frames) => frames,
@@ -306,7 +309,9 @@ impl TraceDim {
     }
 
     fn legend(&self) -> String {
-        let unit = if self.unit.is_empty() { String::new() } else { format!(" {}", self.unit) };
+        // "1" says that there is no unit.
+        let unit =
+            if self.unit.is_empty() || self.unit == "1" { String::new() } else { format!(" {}", self.unit) };
         if self.low > self.high {
             return format!("{}: no numbers", self.name);
         }

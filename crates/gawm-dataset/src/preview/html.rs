@@ -6,7 +6,7 @@ use base64::Engine;
 use gawm_image::{Thumbnail, encode_jpeg};
 
 use super::{COLOURS, Clip, Traces};
-use crate::report::escape;
+use crate::report::{POLICY, escape};
 
 const STYLE: &str = include_str!("../report/style.css");
 const WIDTH: f64 = 1000.0;
@@ -18,12 +18,20 @@ pub(super) fn page(name: &str, clips: &[Clip]) -> String {
     // Writing to a String cannot fail.
     let mut out = format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
-         <meta name=\"color-scheme\" content=\"light dark\"><title>{name}: gawm preview</title>\n<style>{STYLE}</style></head>\n<body>\n\
+         {POLICY}<meta name=\"color-scheme\" content=\"light dark\"><title>{name}: gawm preview</title>\n<style>{STYLE}</style></head>\n<body>\n\
          <header><h1>{name}</h1></header>\n<main>\n"
     );
     for clip in clips {
         write!(out, "<section id=\"episode-{}\"><h2>{}</h2>", clip.episode, escape(&clip.title)).ok();
         for strip in &clip.cameras {
+            if strip
+                .frames
+                .iter()
+                .all(|(_, frame)| frame.as_ref().is_err_and(|reason| reason == super::IN_VIDEO))
+            {
+                write!(out, "<p class=\"soft\">{}: in video files, not shown</p>", escape(&strip.name)).ok();
+                continue;
+            }
             write!(out, "<h3>{}</h3><div class=\"sheet\">", escape(&strip.name)).ok();
             for (row, frame) in &strip.frames {
                 let caption = format!("row {row}");

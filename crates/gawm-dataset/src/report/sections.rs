@@ -48,7 +48,8 @@ pub(super) fn overview(material: &Material<'_>, page: &mut String) {
         facts.push((robot.clone(), "robot"));
     }
     if let Some(lag) = material.examination.action_lag {
-        facts.push((format!("{} rows", lag.rows), "from action to motion"));
+        let unit = if lag.rows.abs() == 1 { "row" } else { "rows" };
+        facts.push((format!("{} {unit}", lag.rows), "from action to motion"));
     }
     page.push_str("<ul class=\"facts\">");
     for (value, name) in facts {
@@ -272,13 +273,17 @@ pub(super) fn dims(material: &Material<'_>, page: &mut String) {
         for dim in column.dims.iter().take(SHOWN_DIMS) {
             let s = dim.values.summary();
             let motion = dim.motion.summary(material.stats.fps);
-            let unit = if dim.unit.is_empty() { String::new() } else { format!(" [{}]", dim.unit) };
+            // "1" says that there is no unit.
+            let has_unit = !dim.unit.is_empty() && dim.unit != "1";
+            let unit = if has_unit { format!(" [{}]", dim.unit) } else { String::new() };
             let missing = if s.n_missing > 0 { format!(", {} missing", s.n_missing) } else { String::new() };
             let name = if dim.name.is_empty() { column.name.clone() } else { dim.name.clone() };
             write!(
                 page,
                 "<div class=\"dim\"><b>{}</b>{}<small>mean {:.4}, std {:.4}, {:.4} to {:.4}{missing}; speed {:.3}/s, idle {:.0} %</small>{}{}</div>",
-                escape(&name), escape(&unit), s.mean, s.std, s.min, s.max, motion.mean_speed, 100.0 * motion.idle_share,
+                escape(&name),
+                escape(&unit),
+                s.mean, s.std, s.min, s.max, motion.mean_speed, 100.0 * motion.idle_share,
                 chart::histogram(dim.values.histogram.counts(), &format!("histogram of {name}")),
                 chart::trace(&dim.trace, &format!("{name} in the first episode"), None)
             )
