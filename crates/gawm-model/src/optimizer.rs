@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use candle_core::backprop::GradStore;
 use candle_core::{DType, Tensor, Var};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -71,11 +70,18 @@ impl Gradients {
     ///
     /// A parameter that the loss does not reach has none.
     pub fn of(loss: &Tensor, parameters: &Parameters) -> Result<Gradients> {
-        let mut store: GradStore = loss.backward()?;
-        let named = parameters
-            .trainable()
-            .filter_map(|(name, variable)| Some((name.to_owned(), store.remove(variable.as_tensor())?)));
-        Ok(Gradients(named.collect()))
+        let (mut store, mut fused) = parameters.sink().collect(|| loss.backward())?;
+        let mut gradients = BTreeMap::new();
+        for (name, variable) in parameters.trainable() {
+            let gradient = match (store.remove(variable.as_tensor()), fused.remove(&variable.as_tensor().id())) {
+                (Some(a), Some(b)) => Some((a + b)?),
+                (a, b) => a.or(b),
+            };
+            if let Some(gradient) = gradient {
+                gradients.insert(name.to_owned(), gradient);
+            }
+        }
+        Ok(Gradients(gradients))
     }
 
     /// Names and gradients, sorted by name.
