@@ -7,9 +7,7 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use candle_core::{
-    CpuStorage, CustomOp2, DType, Device, Layout, Result, Shape, Storage, Tensor, TensorId,
-};
+use candle_core::{CpuStorage, CustomOp2, DType, Device, Layout, Result, Shape, Storage, Tensor, TensorId};
 
 use crate::vit::{Images, Vit, VitShape, VitState};
 
@@ -85,14 +83,32 @@ impl VitEncoder {
     /// # Errors
     ///
     /// - if shapes do not fit `shape`.
-    pub fn forward(&self, images: &Tensor, positions: &Tensor, shape: VitShape, keep: bool) -> Result<Tensor> {
+    pub fn forward(
+        &self,
+        images: &Tensor,
+        positions: &Tensor,
+        shape: VitShape,
+        keep: bool,
+    ) -> Result<Tensor> {
         let (_, c, h, w) = images.dims4()?;
         let fits = c == shape.channels && h >= shape.rows * shape.patch && w >= shape.columns * shape.patch;
         if !fits || shape.rows == 0 || shape.columns == 0 {
-            candle_core::bail!("encoder: expected images of {} channels that hold {} x {} patches of {}, got {:?}", shape.channels, shape.rows, shape.columns, shape.patch, images.dims());
+            candle_core::bail!(
+                "encoder: expected images of {} channels that hold {} x {} patches of {}, got {:?}",
+                shape.channels,
+                shape.rows,
+                shape.columns,
+                shape.patch,
+                images.dims()
+            );
         }
         if positions.elem_count() != shape.tokens() * shape.width {
-            candle_core::bail!("encoder: expected {} positions of width {}, got {:?}", shape.tokens(), shape.width, positions.dims());
+            candle_core::bail!(
+                "encoder: expected {} positions of width {}, got {:?}",
+                shape.tokens(),
+                shape.width,
+                positions.dims()
+            );
         }
         let operation = Encode { encoder: self.clone(), shape, keep, state: Mutex::new(None) };
         images.contiguous()?.apply_op2(&positions.contiguous()?, operation)
@@ -121,7 +137,13 @@ impl Encode {
         Images::new(values, dims[1], dims[2], dims[3])
     }
 
-    fn run(&self, images: Images<'_>, positions: &[f32], keep: bool, output: &mut [f32]) -> Result<Option<VitState>> {
+    fn run(
+        &self,
+        images: Images<'_>,
+        positions: &[f32],
+        keep: bool,
+        output: &mut [f32],
+    ) -> Result<Option<VitState>> {
         let Inner { vit, parameters, .. } = &*self.encoder.0;
         with_values(parameters, |parameters| {
             Ok(vit.forward(&self.shape, images, parameters, positions, keep, output))
@@ -134,7 +156,13 @@ impl CustomOp2 for Encode {
         "vit-encode"
     }
 
-    fn cpu_fwd(&self, images: &CpuStorage, l1: &Layout, positions: &CpuStorage, l2: &Layout) -> Result<(CpuStorage, Shape)> {
+    fn cpu_fwd(
+        &self,
+        images: &CpuStorage,
+        l1: &Layout,
+        positions: &CpuStorage,
+        l2: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
         let images = Encode::images(contiguous(images.as_slice()?, l1)?, l1.dims());
         let mut output = vec![0.0; images.count() * self.shape.width];
         let positions = contiguous(positions.as_slice()?, l2)?;
@@ -142,23 +170,32 @@ impl CustomOp2 for Encode {
         Ok((CpuStorage::F32(output), (images.count(), self.shape.width).into()))
     }
 
-    fn bwd(&self, images: &Tensor, positions: &Tensor, _: &Tensor, d_output: &Tensor) -> Result<(Option<Tensor>, Option<Tensor>)> {
+    fn bwd(
+        &self,
+        images: &Tensor,
+        positions: &Tensor,
+        _: &Tensor,
+        d_output: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let Inner { vit, parameters, sink } = &*self.encoder.0;
         let kept = lock(&self.state).take();
-        let gradients = with_values(&[images.clone(), positions.clone(), d_output.contiguous()?], |values| {
-            let view = Encode::images(values[0], images.dims());
-            let state = match kept {
-                Some(state) => Some(state),
-                None => {
-                    let mut output = vec![0.0; view.count() * self.shape.width];
-                    self.run(view, values[1], true, &mut output)?
-                }
-            };
-            let Some(state) = state else { candle_core::bail!("vit-encode: a pass that keeps its values returned none") };
-            with_values(parameters, |parameters| {
-                Ok(vit.backward(&self.shape, view, parameters, state, values[2]))
-            })
-        })?;
+        let gradients =
+            with_values(&[images.clone(), positions.clone(), d_output.contiguous()?], |values| {
+                let view = Encode::images(values[0], images.dims());
+                let state = match kept {
+                    Some(state) => Some(state),
+                    None => {
+                        let mut output = vec![0.0; view.count() * self.shape.width];
+                        self.run(view, values[1], true, &mut output)?
+                    }
+                };
+                let Some(state) = state else {
+                    candle_core::bail!("vit-encode: a pass that keeps its values returned none")
+                };
+                with_values(parameters, |parameters| {
+                    Ok(vit.backward(&self.shape, view, parameters, state, values[2]))
+                })
+            })?;
         for (parameter, gradient) in parameters.iter().zip(gradients.parameters) {
             sink.put(parameter, Tensor::from_vec(gradient, parameter.shape(), &Device::Cpu)?)?;
         }
@@ -167,7 +204,7 @@ impl CustomOp2 for Encode {
 }
 
 /// Calls `work` with the values of contiguous f32 tensors on the CPU.
-fn with_values<T>(tensors: &[Tensor], work: impl FnOnce(&[&[f32]]) -> Result<T>) -> Result<T> {
+pub(crate) fn with_values<T>(tensors: &[Tensor], work: impl FnOnce(&[&[f32]]) -> Result<T>) -> Result<T> {
     let guards: Vec<_> = tensors.iter().map(Tensor::storage_and_layout).collect();
     let values = guards.iter().map(|(storage, layout)| match &**storage {
         Storage::Cpu(storage) => contiguous(storage.as_slice()?, layout),
@@ -177,7 +214,7 @@ fn with_values<T>(tensors: &[Tensor], work: impl FnOnce(&[&[f32]]) -> Result<T>)
 }
 
 /// The elements of a contiguous layout.
-fn contiguous<'a>(values: &'a [f32], layout: &Layout) -> Result<&'a [f32]> {
+pub(crate) fn contiguous<'a>(values: &'a [f32], layout: &Layout) -> Result<&'a [f32]> {
     match layout.contiguous_offsets() {
         Some((start, end)) => Ok(&values[start..end]),
         None => candle_core::bail!("kernels: expected a contiguous tensor, got {layout:?}"),

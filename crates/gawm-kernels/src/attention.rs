@@ -9,7 +9,7 @@
 //! row's sum; backward computes the probabilities again from it.
 
 use crate::gemm::{ACCUMULATE, Epilogue, Lhs, Packed, Rhs, STORE, gemm, panel_width};
-use crate::simd::{exp, max_of, mul_add, sum_by, vectorized};
+use crate::simd::{dot, exp, max_of, mul_add, sum, vectorized};
 
 /// Queries per block: a multiple of every register tile.
 const BLOCK: usize = 48;
@@ -137,8 +137,22 @@ impl Attention {
                 let rows = BLOCK.min(self.queries - start);
                 let at = start * width + first;
                 let block = |values| Lhs { values, row_stride: width, k_stride: 1 };
-                gemm([rows, padded, d], block(&inputs.q[at..]), Rhs::Packed(&scratch.keys), &mut scratch.scores, padded, STORE);
-                gemm([rows, padded, d], block(&d_output[at..]), Rhs::Packed(&scratch.values), &mut scratch.gradients, padded, STORE);
+                gemm(
+                    [rows, padded, d],
+                    block(&inputs.q[at..]),
+                    Rhs::Packed(&scratch.keys),
+                    &mut scratch.scores,
+                    padded,
+                    STORE,
+                );
+                gemm(
+                    [rows, padded, d],
+                    block(&d_output[at..]),
+                    Rhs::Packed(&scratch.values),
+                    &mut scratch.gradients,
+                    padded,
+                    STORE,
+                );
                 row_products(&output[at..], &d_output[at..], width, d, &mut scratch.products[..rows]);
                 let log_sums = &log_sums[head * self.queries + start..][..rows];
                 let (p, ds) = (&mut scratch.scores[..rows * padded], &mut scratch.gradients[..rows * padded]);
@@ -148,10 +162,31 @@ impl Attention {
                 let (p, ds) = (&scratch.scores, &scratch.gradients);
                 let transposed = |values| Lhs { values, row_stride: 1, k_stride: padded };
                 let rows_of = |values| Rhs::Rows { values, stride: width };
-                gemm([self.keys, d, rows], transposed(p), rows_of(&d_output[at..]), &mut gradients.v[first..], width, then);
-                gemm([self.keys, d, rows], transposed(ds), rows_of(&inputs.q[at..]), &mut gradients.k[first..], width, then);
+                gemm(
+                    [self.keys, d, rows],
+                    transposed(p),
+                    rows_of(&d_output[at..]),
+                    &mut gradients.v[first..],
+                    width,
+                    then,
+                );
+                gemm(
+                    [self.keys, d, rows],
+                    transposed(ds),
+                    rows_of(&inputs.q[at..]),
+                    &mut gradients.k[first..],
+                    width,
+                    then,
+                );
                 let ds = Lhs { values: ds, row_stride: padded, k_stride: 1 };
-                gemm([rows, d, self.keys], ds, rows_of(&inputs.k[first..]), &mut gradients.q[at..], width, Epilogue::default());
+                gemm(
+                    [rows, d, self.keys],
+                    ds,
+                    rows_of(&inputs.k[first..]),
+                    &mut gradients.q[at..],
+                    width,
+                    Epilogue::default(),
+                );
             }
         }
     }
@@ -167,12 +202,12 @@ vectorized! {
             for x in row.iter_mut() {
                 *x = exp::<FMA>((*x - largest) * scale);
             }
-            let sum = sum_by::<FMA>(count, |i| row[i]);
-            let inverse = 1.0 / sum;
+            let total = sum(row);
+            let inverse = 1.0 / total;
             for x in row.iter_mut() {
                 *x *= inverse;
             }
-            *log_sum = mul_add::<FMA>(largest, scale, sum.ln());
+            *log_sum = mul_add::<FMA>(largest, scale, total.ln());
         }
     }
 
@@ -199,7 +234,7 @@ vectorized! {
     fn row_products(a: &[f32], b: &[f32], stride: usize, count: usize, products: &mut [f32]) {
         for (row, product) in products.iter_mut().enumerate() {
             let (a, b) = (&a[row * stride..][..count], &b[row * stride..][..count]);
-            *product = sum_by::<FMA>(count, |i| a[i] * b[i]);
+            *product = dot::<FMA>(a, b);
         }
     }
 }

@@ -148,7 +148,10 @@ pub fn gemm(
     if k == 0 {
         return without_terms([m, n], c, c_stride, epilogue);
     }
-    assert!((m - 1) * a.row_stride + (k - 1) * a.k_stride < a.values.len(), "gemm: left operand is too short");
+    assert!(
+        (m - 1) * a.row_stride + (k - 1) * a.k_stride < a.values.len(),
+        "gemm: left operand is too short"
+    );
     match b {
         Rhs::Rows { values, stride } => {
             assert!((k - 1) * stride + n <= values.len(), "gemm: right operand is too short");

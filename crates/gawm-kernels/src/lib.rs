@@ -3,6 +3,7 @@
 
 mod simd;
 
+pub mod adamw;
 pub mod attention;
 pub mod gelu;
 pub mod gemm;
@@ -11,6 +12,7 @@ pub mod profile;
 pub mod vit;
 
 mod adapter;
+pub mod memory;
 
 pub use adapter::{GradientSink, VitEncoder};
 pub use simd::{Level, detect, level, limit_level};

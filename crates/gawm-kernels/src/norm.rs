@@ -7,7 +7,7 @@
 //!
 //! The backward pass needs `xhat` and `rstd` only, so that these are what a layer keeps.
 
-use crate::simd::{mul_add, sum_by, vectorized};
+use crate::simd::{dot, mul_add, sum, vectorized};
 
 vectorized! {
     /// Normalises each row of `x` [rows, width] into `xhat` and writes `1 / sqrt(var + epsilon)` of each row to `rstd`.
@@ -20,11 +20,11 @@ vectorized! {
         let rows = x.len() / width;
         let (xhat, rstd) = (&mut xhat[..rows * width], &mut rstd[..rows]);
         for ((x, y), rstd) in x.chunks_exact(width).zip(xhat.chunks_exact_mut(width)).zip(rstd) {
-            let mean = sum_by::<FMA>(width, |i| x[i]) * inverse;
+            let mean = sum(x) * inverse;
             for (y, x) in y.iter_mut().zip(x) {
                 *y = x - mean;
             }
-            let variance = sum_by::<FMA>(width, |i| y[i] * y[i]) * inverse;
+            let variance = dot::<FMA>(y, y) * inverse;
             *rstd = 1.0 / (variance + epsilon).sqrt();
             for y in y.iter_mut() {
                 *y *= *rstd;
@@ -73,8 +73,8 @@ vectorized! {
             for (g, w) in g.iter_mut().zip(weight) {
                 *g *= w;
             }
-            let mean = sum_by::<FMA>(width, |i| g[i]) * inverse;
-            let along = sum_by::<FMA>(width, |i| g[i] * x[i]) * inverse;
+            let mean = sum(g) * inverse;
+            let along = dot::<FMA>(g, x) * inverse;
             for ((dx, g), x) in dx.iter_mut().zip(g.iter()).zip(x) {
                 *dx = mul_add::<FMA>(*rstd, mul_add::<FMA>(-along, *x, g - mean), *dx);
             }

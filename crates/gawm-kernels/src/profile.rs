@@ -1,9 +1,9 @@
 //! Where the time goes: nanoseconds and floating-point operations per kind of operation, over all threads.
 //!
-//! Off unless [`start`] was called; then a span costs two readings of the clock.
+//! Off unless [`start`] was called; then a span costs two readings of the thread's CPU clock (of the monotonic clock where
+//! there is none), so that waiting for a core on a busy machine is not counted.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::time::Instant;
 
 /// A kind of operation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -60,7 +60,7 @@ static OPERATIONS: [AtomicU64; KINDS.len()] = [const { AtomicU64::new(0) }; KIND
 pub struct Share {
     /// The kind.
     pub kind: Kind,
-    /// Time inside its spans, seconds, summed over threads.
+    /// CPU time inside its spans, seconds, summed over threads.
     pub secs: f64,
     /// Floating-point operations counted (products only), in units of 10^9.
     pub gflop: f64,
@@ -92,9 +92,26 @@ pub(crate) fn span<T>(kind: Kind, operations: usize, work: impl FnOnce() -> T) -
     if !ON.load(Ordering::Relaxed) {
         return work();
     }
-    let start = Instant::now();
+    let start = thread_nanoseconds();
     let result = work();
-    NANOSECONDS[kind as usize].fetch_add(start.elapsed().as_nanos() as u64, Ordering::Relaxed);
+    let elapsed = thread_nanoseconds().saturating_sub(start);
+    NANOSECONDS[kind as usize].fetch_add(elapsed, Ordering::Relaxed);
     OPERATIONS[kind as usize].fetch_add(operations as u64, Ordering::Relaxed);
     result
+}
+
+/// CPU time of this thread.
+#[cfg(target_os = "linux")]
+fn thread_nanoseconds() -> u64 {
+    let mut time = libc::timespec { tv_sec: 0, tv_nsec: 0 };
+    // SAFETY: the pointer is to a valid timespec, which the call fills; a failed call leaves it zero.
+    unsafe { libc::clock_gettime(libc::CLOCK_THREAD_CPUTIME_ID, &raw mut time) };
+    time.tv_sec as u64 * 1_000_000_000 + time.tv_nsec as u64
+}
+
+/// Time since the first call.
+#[cfg(not(target_os = "linux"))]
+fn thread_nanoseconds() -> u64 {
+    static START: std::sync::OnceLock<std::time::Instant> = std::sync::OnceLock::new();
+    START.get_or_init(std::time::Instant::now).elapsed().as_nanos() as u64
 }

@@ -105,20 +105,34 @@ pub(crate) fn mul_add<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
 /// Lanes of the partial sums of reductions; a multiple of every vector width, so that all levels vectorise.
 const LANES: usize = 16;
 
-/// Sums `f` over the indices below `n` in 16 interleaved partial sums: a fixed order, whatever the threads.
+/// Sums `x` in 16 interleaved partial sums: a fixed order, whatever the threads.
 #[inline(always)]
-pub(crate) fn sum_by<const FMA: bool>(n: usize, mut f: impl FnMut(usize) -> f32) -> f32 {
+pub(crate) fn sum(x: &[f32]) -> f32 {
     let mut lanes = [0f32; LANES];
-    let whole = n - n % LANES;
-    let mut start = 0;
-    while start < whole {
-        for (lane, sum) in lanes.iter_mut().enumerate() {
-            *sum += f(start + lane);
+    let mut chunks = x.chunks_exact(LANES);
+    for chunk in &mut chunks {
+        for (lane, x) in lanes.iter_mut().zip(chunk) {
+            *lane += x;
         }
-        start += LANES;
     }
-    for index in whole..n {
-        lanes[index - whole] += f(index);
+    for (lane, x) in lanes.iter_mut().zip(chunks.remainder()) {
+        *lane += x;
+    }
+    fold(lanes, |a, b| a + b)
+}
+
+/// Sums the products of `a` and `b`, in the order of [`sum`].
+#[inline(always)]
+pub(crate) fn dot<const FMA: bool>(a: &[f32], b: &[f32]) -> f32 {
+    let mut lanes = [0f32; LANES];
+    let (mut chunks, mut others) = (a.chunks_exact(LANES), b.chunks_exact(LANES));
+    for (a, b) in (&mut chunks).zip(&mut others) {
+        for ((lane, a), b) in lanes.iter_mut().zip(a).zip(b) {
+            *lane = mul_add::<FMA>(*a, *b, *lane);
+        }
+    }
+    for ((lane, a), b) in lanes.iter_mut().zip(chunks.remainder()).zip(others.remainder()) {
+        *lane = mul_add::<FMA>(*a, *b, *lane);
     }
     fold(lanes, |a, b| a + b)
 }
@@ -173,8 +187,8 @@ pub(crate) fn exp<const FMA: bool>(x: f32) -> f32 {
     // 2^n by its exponent bits, in two factors, since n = 128 has none of its own.
     let n = (shifted.to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32);
     let half = n >> 1;
-    let scale = |n: i32| f32::from_bits(((n + 127) as u32) << 23);
-    let y = p * scale(half) * scale(n - half);
+    let scale = |n: i32| f32::from_bits((n.wrapping_add(127) as u32) << 23);
+    let y = p * scale(half) * scale(n.wrapping_sub(half));
     if x < -87.336_54 { 0.0 } else { y }
 }
 
@@ -249,7 +263,8 @@ mod tests {
     fn reductions_see_every_element() {
         for n in [0, 1, 15, 16, 17, 33] {
             let x: Vec<f32> = (0..n).map(|i| i as f32).collect();
-            assert_eq!(sum_by::<false>(n, |i| x[i]), (0..n).map(|i| i as f32).sum::<f32>());
+            assert_eq!(sum(&x), (0..n).map(|i| i as f32).sum::<f32>());
+            assert_eq!(dot::<false>(&x, &x), (0..n).map(|i| (i * i) as f32).sum::<f32>());
             assert_eq!(max_of(&x), x.iter().copied().fold(f32::NEG_INFINITY, f32::max));
         }
     }

@@ -2,11 +2,13 @@
 //!
 //! `cargo run --release -p gawm-model --example bench_step -- MODE [PRESET] [CLIPS] [REPEATS]`, where MODE is `step`,
 //! `encode` or `plan`; `bench_peer.py` prints the same lines for PyTorch. `RAYON_NUM_THREADS` sets the threads.
+//! With `--profile` a further repeat is counted by the kernels: seconds of all threads and GFLOP/s per kind.
 //! A line has the smallest wall time and the smallest user CPU time of a repeat, after one repeat that is not counted.
 
 use std::time::Instant;
 
 use anyhow::{Context, bail};
+use gawm_kernels::profile;
 use gawm_model::objective::StateRule;
 use gawm_model::plan::{CemConfig, SeededNoise, Start, plan_to_goal};
 use gawm_model::{
@@ -17,7 +19,9 @@ use gawm_model::{
 const WIDTHS: DataWidths = DataWidths { action: 10, state: 6 };
 
 fn main() -> anyhow::Result<()> {
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let mut arguments: Vec<String> = std::env::args().skip(1).collect();
+    let profiled = arguments.iter().any(|argument| argument == "--profile");
+    arguments.retain(|argument| argument != "--profile");
     let argument = |index: usize| arguments.get(index).map(String::as_str);
     let mode = argument(0).context("expected step, encode or plan")?;
     let preset = argument(1).unwrap_or("tiny-14");
@@ -30,11 +34,13 @@ fn main() -> anyhow::Result<()> {
     let frames = normal("frames", &[clips, 4, 3, size, size])?;
     let best = match mode {
         "step" => {
-            let (actions, states) =
-                (normal("actions", &[clips, 4, WIDTHS.action])?, normal("states", &[clips, 4, WIDTHS.state])?);
+            let (actions, states) = (
+                normal("actions", &[clips, 4, WIDTHS.action])?,
+                normal("states", &[clips, 4, WIDTHS.state])?,
+            );
             let clips = Clips::try_new(frames, actions, states, None, &StateRule::default())?;
             let mut optimizer = AdamW::new(AdamWConfig::default());
-            measure(repeats, || {
+            measure(repeats, profiled, || {
                 let pass = Pass::train(9, optimizer.step_count());
                 let losses = losses(&model, &clips, &Objectives::default(), &pass)?;
                 let gradients = Gradients::of(&losses.total, model.parameters())?;
@@ -42,11 +48,11 @@ fn main() -> anyhow::Result<()> {
                 Ok(())
             })?
         }
-        "encode" => measure(repeats, || {
+        "encode" => measure(repeats, profiled, || {
             model.encode(&frames, &Pass::eval())?.detach();
             Ok(())
         })?,
-        "plan" => measure(repeats, || plan(&model, size))?,
+        "plan" => measure(repeats, profiled, || plan(&model, size))?,
         other => bail!("unknown mode {other:?}: expected step, encode or plan"),
     };
     println!(
@@ -78,7 +84,11 @@ struct Best {
     user_secs: f64,
 }
 
-fn measure(repeats: usize, mut work: impl FnMut() -> anyhow::Result<()>) -> anyhow::Result<Best> {
+fn measure(
+    repeats: usize,
+    profiled: bool,
+    mut work: impl FnMut() -> anyhow::Result<()>,
+) -> anyhow::Result<Best> {
     work()?;
     let mut best = Best { wall_secs: f64::INFINITY, user_secs: f64::INFINITY };
     for _ in 0..repeats {
@@ -87,7 +97,31 @@ fn measure(repeats: usize, mut work: impl FnMut() -> anyhow::Result<()>) -> anyh
         best.wall_secs = best.wall_secs.min(wall.elapsed().as_secs_f64());
         best.user_secs = best.user_secs.min(user_secs()? - user);
     }
+    if profiled {
+        print_profile(&mut work)?;
+    }
     Ok(best)
+}
+
+/// Prints what the kernels counted in one repeat, and what that repeat took besides.
+fn print_profile(work: &mut impl FnMut() -> anyhow::Result<()>) -> anyhow::Result<()> {
+    let user = user_secs()?;
+    profile::start();
+    work()?;
+    let shares = profile::stop();
+    let total = user_secs()? - user;
+    for share in &shares {
+        let rate = if share.secs > 0.0 { share.gflop / share.secs } else { 0.0 };
+        let kind = format!("{:?}", share.kind);
+        println!(
+            "{kind:<22} {:>8.4} s {:>5.1} % {rate:>7.1} GFLOP/s",
+            share.secs,
+            100.0 * share.secs / total
+        );
+    }
+    let rest = total - shares.iter().map(|share| share.secs).sum::<f64>();
+    println!("{:<22} {rest:>8.4} s {:>5.1} %", "elsewhere", 100.0 * rest / total);
+    Ok(())
 }
 
 /// User CPU time of this process; Linux counts it in hundredths of a second.

@@ -138,7 +138,8 @@ impl Vit {
         names.extend(["weight", "bias"].map(|which| format!("encoder.layernorm.{which}")));
         for layer in 0..depth {
             for part in FUSED_PARTS {
-                names.extend(["weight", "bias"].map(|which| format!("encoder.layers.{layer}.{part}.{which}")));
+                names
+                    .extend(["weight", "bias"].map(|which| format!("encoder.layers.{layer}.{part}.{which}")));
             }
         }
         let tensors = names.iter().map(|name| parameters.get(name)).collect::<Result<_>>()?;

@@ -1,10 +1,10 @@
 //! A few images on one thread: patches, all layers, the last norm, and back.
 
+use super::VitShape;
 use super::layer::{LayerPass, LayerState};
 use super::weights::{
     CLASS_TOKEN, LAST_NORM, LAYER_PARAMETERS, Layout, OUTER_PARAMETERS, PATCH_BIAS, PATCH_WEIGHT, Packs,
 };
-use super::VitShape;
 use crate::attention::AttentionScratch;
 use crate::gemm::{ACCUMULATE, Epilogue, Lhs, Rhs, gemm};
 use crate::norm;

@@ -2,9 +2,7 @@
 
 use super::VitShape;
 use super::chunk::{Scratch, sized};
-use super::weights::{
-    CONTRACT, EXPAND, KEY, Layout, NORM_AFTER, NORM_BEFORE, OUTPUT, Packs, QUERY, VALUE,
-};
+use super::weights::{CONTRACT, EXPAND, KEY, Layout, NORM_AFTER, NORM_BEFORE, OUTPUT, Packs, QUERY, VALUE};
 use crate::attention::{Attention, AttentionGradients, AttentionInputs};
 use crate::gelu::{gelu, gelu_backward};
 use crate::gemm::{ACCUMULATE, Epilogue, Lhs, Rhs, STORE, gemm};
@@ -121,7 +119,9 @@ impl LayerPass<'_> {
         let (w, tokens, rows) = (self.shape.width, self.tokens(), self.query_rows());
         let y = sized(&mut scratch.y, tokens * w);
         let xhat = &state.xhat_before[..tokens * w];
-        span(Kind::Norm, 0, || norm::scale_shift(xhat, self.parameters[NORM_BEFORE], self.parameters[NORM_BEFORE + 1], y));
+        span(Kind::Norm, 0, || {
+            norm::scale_shift(xhat, self.parameters[NORM_BEFORE], self.parameters[NORM_BEFORE + 1], y)
+        });
         self.weight_gradient(QUERY, [rows, w, w], &scratch.q, y, self.query_stride(), layout, sums);
         self.weight_gradient(KEY, [tokens, w, w], &scratch.k, y, w, layout, sums);
         self.weight_gradient(VALUE, [tokens, w, w], &scratch.v, y, w, layout, sums);
@@ -133,7 +133,15 @@ impl LayerPass<'_> {
         if self.queries == 1 {
             self.spread(dx);
         }
-        self.norm_backward(NORM_BEFORE, &mut scratch.y[..tokens * w], xhat, &state.rstd_before, dx, layout, sums);
+        self.norm_backward(
+            NORM_BEFORE,
+            &mut scratch.y[..tokens * w],
+            xhat,
+            &state.rstd_before,
+            dx,
+            layout,
+            sums,
+        );
     }
 
     /// Moves rows of class tokens to their places among all tokens; the others are zero.
@@ -155,7 +163,9 @@ impl LayerPass<'_> {
         self.weight_gradient(CONTRACT, [rows, w, f], dx, hidden, f, layout, sums);
         let y = sized(&mut scratch.y, rows * w);
         let xhat = &state.xhat_after[..rows * w];
-        span(Kind::Norm, 0, || norm::scale_shift(xhat, self.parameters[NORM_AFTER], self.parameters[NORM_AFTER + 1], y));
+        span(Kind::Norm, 0, || {
+            norm::scale_shift(xhat, self.parameters[NORM_AFTER], self.parameters[NORM_AFTER + 1], y)
+        });
         self.weight_gradient(EXPAND, [rows, f, w], d_hidden, y, w, layout, sums);
         self.input_gradient(EXPAND, [rows, f, w], d_hidden, y, w, STORE);
         self.norm_backward(NORM_AFTER, y, xhat, &state.rstd_after, dx, layout, sums);
@@ -207,7 +217,10 @@ impl LayerPass<'_> {
     }
 
     /// Adds the gradient of a norm's input to `dx`, overwriting `dy`.
-    #[expect(clippy::too_many_arguments, reason = "the three buffers of a norm, its place, and where gradients go")]
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "the three buffers of a norm, its place, and where gradients go"
+    )]
     fn norm_backward(
         &self,
         which: usize,

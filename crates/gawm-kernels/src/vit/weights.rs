@@ -76,7 +76,8 @@ impl Packs {
 
     /// The panels of one of the [`LINEARS`] of a layer.
     pub(super) fn linear(&self, layer: usize, linear: usize) -> &Packed {
-        let index = LINEARS.iter().position(|&l| l == linear).expect("the linear layers are those of the list");
+        let index =
+            LINEARS.iter().position(|&l| l == linear).expect("the linear layers are those of the list");
         &self.layers[layer][index]
     }
 }

@@ -30,7 +30,9 @@ fn check_product(m: usize, n: usize, k: usize, gap: usize) {
                             f64::from(a[i * row_stride + kk * k_stride]) * f64::from(b[kk * b_k + j * b_n])
                         };
                         let kept = if accumulate { *c } else { 0.0 };
-                        *c = kept + (0..k).map(term).sum::<f64>() + bias.map_or(0.0, |bias| f64::from(bias[j]));
+                        *c = kept
+                            + (0..k).map(term).sum::<f64>()
+                            + bias.map_or(0.0, |bias| f64::from(bias[j]));
                     }
                 }
                 let mut c = start.clone();
@@ -45,7 +47,9 @@ fn check_product(m: usize, n: usize, k: usize, gap: usize) {
 #[test]
 fn products_equal_naive_sums() {
     at_all_levels(|| {
-        for (m, n, k) in [(1, 1, 1), (12, 32, 7), (13, 33, 5), (25, 16, 64), (5, 47, 12), (7, 6, 3), (26, 65, 31)] {
+        for (m, n, k) in
+            [(1, 1, 1), (12, 32, 7), (13, 33, 5), (25, 16, 64), (5, 47, 12), (7, 6, 3), (26, 65, 31)]
+        {
             check_product(m, n, k, 0);
             check_product(m, n, k, 3);
         }
@@ -59,7 +63,8 @@ fn empty_sums_are_the_bias() {
         let lhs = Lhs { values: &[], row_stride: 1, k_stride: 1 };
         let epilogue = Epilogue { accumulate, bias: Some(&[0.5, 0.25]) };
         gemm([2, 2, 0], lhs, Rhs::Rows { values: &[], stride: 2 }, &mut c, 3, epilogue);
-        let expected = if accumulate { [1.5, 2.25, 9.0, 3.5, 4.25, 9.0] } else { [0.5, 0.25, 9.0, 0.5, 0.25, 9.0] };
+        let expected =
+            if accumulate { [1.5, 2.25, 9.0, 3.5, 4.25, 9.0] } else { [0.5, 0.25, 9.0, 0.5, 0.25, 9.0] };
         assert_eq!(c, expected);
     }
 }

@@ -36,7 +36,8 @@ pub(crate) fn noise(seed: u64, count: usize) -> Vec<f32> {
 /// Asserts that `got` is `expected` to within `allowed` times (1 + |expected|), and names the worst element.
 pub(crate) fn assert_close(what: &str, got: &[f32], expected: &[f64], allowed: f64) {
     assert_eq!(got.len(), expected.len(), "{what}: length");
-    let error = |index: usize| (f64::from(got[index]) - expected[index]).abs() / (1.0 + expected[index].abs());
+    let error =
+        |index: usize| (f64::from(got[index]) - expected[index]).abs() / (1.0 + expected[index].abs());
     let Some(worst) = (0..got.len()).max_by(|&a, &b| error(a).total_cmp(&error(b))) else { return };
     let level = gawm_kernels::level();
     assert!(
