@@ -228,6 +228,3 @@ fn take<T: Default>(pool: &Mutex<Vec<T>>) -> T {
 fn put<T>(pool: &Mutex<Vec<T>>, value: T) {
     pool.lock().unwrap_or_else(std::sync::PoisonError::into_inner).push(value);
 }
-
-#[cfg(test)]
-mod tests;
