@@ -115,6 +115,15 @@ impl Subscriber {
         Ok(Slot { sample, layout: greeted.layout, header })
     }
 
+    /// Returns whether a message is queued: the next wait is then none.
+    ///
+    /// # Errors
+    /// [`ShmError::Transport`]
+    pub fn is_queued(&self) -> Result<bool, ShmError> {
+        let queued = self.port.has_samples();
+        queued.map_err(|e| ShmError::transport(&self.domain.service, "ask for slots")(&e))
+    }
+
     /// Returns whether the loader's process is alive.
     pub fn is_loader_alive(&self) -> bool {
         self.domain.is_loader_alive()
