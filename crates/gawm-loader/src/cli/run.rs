@@ -15,7 +15,7 @@ pub(crate) struct RunArgs {
     #[command(flatten)]
     data: DataArgs,
     /// Name of the trainer's service
-    #[arg(long, value_name = "NAME", required_unless_present = "print_config")]
+    #[arg(long, value_name = "NAME", required_unless_present_any = ["print_config", "hello"])]
     service: Option<String>,
     /// Number of this loader, from 0
     #[arg(long, value_name = "K", default_value_t = 0)]
