@@ -56,20 +56,14 @@ impl Claim {
     /// - [`ShmError::Transport`], [`ShmError::Io`]
     ///
     /// # Panics
-    /// If `loader` is not below `loaders`, or `slots` is 0.
-    pub fn subscribe(
-        &self,
-        loader: u32,
-        loaders: u32,
-        slots: usize,
-        deadline: Instant,
-    ) -> Result<Subscriber, ShmError> {
-        assert!(loader < loaders && slots > 0, "loader {loader} of {loaders} with {slots} slots");
+    /// If `loader` is not below `loaders`.
+    pub fn subscribe(&self, loader: u32, loaders: u32, deadline: Instant) -> Result<Subscriber, ShmError> {
+        assert!(loader < loaders, "loader {loader} of {loaders}");
         let domain = self.service.domain(loader);
         // Held until the service is there, so that no loader sees half of it.
         let _lock = self.sweep(loader, deadline)?;
         let token = new_token()?;
-        let subscriber = Subscriber::open(domain.clone(), &token, loaders, slots)?;
+        let subscriber = Subscriber::open(domain.clone(), &token, loaders)?;
         domain.write_ready(&token)?;
         Ok(subscriber)
     }

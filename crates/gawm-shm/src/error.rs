@@ -15,6 +15,12 @@ pub enum ShmError {
         /// The name.
         name: String,
     },
+    /// A loader asks for an impossible number of slots.
+    #[error("expected 1 to {} slots, got {got}", crate::MAX_SLOTS)]
+    Slots {
+        /// The number.
+        got: usize,
+    },
     /// Another trainer has the name.
     #[error("service name {name:?} is in use by another trainer (process {process})")]
     NameInUse {

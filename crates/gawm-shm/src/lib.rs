@@ -46,7 +46,7 @@ pub use claim::Claim;
 pub use error::ShmError;
 pub use place::{CleanReport, Place};
 pub use publisher::{Publisher, PublisherOptions, SlotMut};
-pub use subscriber::{Slot, Subscriber};
+pub use subscriber::{MAX_SLOTS, Slot, Subscriber};
 
 #[cfg(test)]
 mod tests;

@@ -15,7 +15,7 @@ use crate::domain::{Domain, Ipc};
 use crate::error::ShmError;
 use crate::lock::{self, Lock};
 use crate::place::{Place, ServicePlace};
-use crate::subscriber::{Channel, channel_name};
+use crate::subscriber::{Channel, MAX_SLOTS, channel_name};
 use crate::wait::Wait;
 use crate::{greeting, room};
 
@@ -33,8 +33,8 @@ pub struct PublisherOptions {
     pub loader: u32,
     /// The number of loaders.
     pub loaders: u32,
-    /// Batches that may be unconsumed at a time, the one being made included; at least 1 and at most what the trainer
-    /// subscribed with.
+    /// Batches that may be unconsumed at a time, the one being made included; 1 to
+    /// [`MAX_SLOTS`].
     pub slots: usize,
 }
 
@@ -66,6 +66,7 @@ impl Publisher {
     /// - [`ShmError::NoTrainer`] if there is none by the deadline
     /// - [`ShmError::LoaderInUse`] if another loader of this number is alive
     /// - [`ShmError::NoRoom`] if the slots do not fit into shared memory
+    /// - [`ShmError::Slots`] if there are none or more than [`MAX_SLOTS`]
     /// - [`ShmError::Batch`] if the shape in the hello cannot be laid out
     /// - [`ShmError::BadName`], [`ShmError::Transport`], [`ShmError::Io`]
     pub fn connect(
@@ -76,6 +77,9 @@ impl Publisher {
         deadline: Instant,
     ) -> Result<Publisher, ShmError> {
         let PublisherOptions { loader, slots, .. } = options;
+        if !(1..=MAX_SLOTS).contains(&slots) {
+            return Err(ShmError::Slots { got: slots });
+        }
         let service = place.service(name)?;
         let layout = hello.layout().map_err(|source| ShmError::Batch { loader, source })?;
         let json = hello.to_json();
@@ -294,8 +298,8 @@ fn open(
         .max_nodes(2)
         .history_size(0)
         .enable_safe_overflow(false)
-        .subscriber_max_buffer_size(slots)
-        .subscriber_max_borrowed_samples(slots)
+        .subscriber_max_buffer_size(MAX_SLOTS)
+        .subscriber_max_borrowed_samples(MAX_SLOTS)
         .open();
     let channel = channel.map_err(|e| refused("open the service")(&e))?;
     let port = channel

@@ -16,6 +16,11 @@ use crate::error::ShmError;
 use crate::greeting;
 use crate::wait::Wait;
 
+/// Most slots that a loader may have.
+///
+/// A place in a queue is a few bytes, so the trainer always has room for so many and need not know how many there are.
+pub const MAX_SLOTS: usize = 16;
+
 /// The iceoryx2 service of one loader.
 pub(crate) type Channel = PortFactory<Ipc, [Chunk], ()>;
 
@@ -26,7 +31,7 @@ pub(crate) type Channel = PortFactory<Ipc, [Chunk], ()>;
 /// # fn main() -> Result<(), Box<dyn std::error::Error>> {
 /// let in_10_s = || Instant::now() + Duration::from_secs(10);
 /// let claim = gawm_shm::Claim::take(&gawm_shm::Place::of_user(), "run-1", in_10_s())?;
-/// let mut subscriber = claim.subscribe(0, 1, 3, in_10_s())?;
+/// let mut subscriber = claim.subscribe(0, 1, in_10_s())?;
 /// // ... start the loader: gawm-loader run --service run-1 --loader 0 --loaders 1 --start 0 ...
 /// let hello = subscriber.hello(in_10_s())?.clone();
 /// for n in 0..hello.sequence.batches() {
@@ -56,15 +61,10 @@ struct Greeted {
 }
 
 impl Subscriber {
-    pub(crate) fn open(
-        domain: Domain,
-        token: &str,
-        loaders: u32,
-        slots: usize,
-    ) -> Result<Subscriber, ShmError> {
+    pub(crate) fn open(domain: Domain, token: &str, loaders: u32) -> Result<Subscriber, ShmError> {
         let node = domain.node()?;
-        let channel = create_channel(&node, &domain.service, token, slots)?;
-        let port = channel.subscriber_builder().buffer_size(slots).create();
+        let channel = create_channel(&node, &domain.service, token)?;
+        let port = channel.subscriber_builder().buffer_size(MAX_SLOTS).create();
         let port = port.map_err(|e| ShmError::transport(&domain.service, "subscribe")(&e))?;
         Ok(Subscriber { port, _channel: channel, _node: node, domain, loaders, hello: None })
     }
@@ -204,7 +204,7 @@ impl Deref for Slot {
 }
 
 /// Creates the service as the trainer.
-fn create_channel(node: &Node<Ipc>, service: &str, token: &str, slots: usize) -> Result<Channel, ShmError> {
+fn create_channel(node: &Node<Ipc>, service: &str, token: &str) -> Result<Channel, ShmError> {
     let name = channel_name(service, token)?;
     // One queued and one borrowed place per slot: a subscriber can have them all either way.
     let builder = node.service_builder(&name).publish_subscribe::<[Chunk]>();
@@ -214,8 +214,8 @@ fn create_channel(node: &Node<Ipc>, service: &str, token: &str, slots: usize) ->
         .max_nodes(2)
         .history_size(0)
         .enable_safe_overflow(false)
-        .subscriber_max_buffer_size(slots)
-        .subscriber_max_borrowed_samples(slots)
+        .subscriber_max_buffer_size(MAX_SLOTS)
+        .subscriber_max_borrowed_samples(MAX_SLOTS)
         .create();
     created.map_err(|e| ShmError::transport(service, "create the service")(&e))
 }

@@ -95,7 +95,7 @@ fn options() -> PublisherOptions {
 /// A trainer's and a loader's side in one process.
 fn pair(place: &Place, hello: &Hello) -> (Claim, Subscriber, Publisher) {
     let claim = Claim::take(place, "pair", in_30_s()).unwrap();
-    let subscriber = claim.subscribe(0, 1, SLOTS, in_30_s()).unwrap();
+    let subscriber = claim.subscribe(0, 1, in_30_s()).unwrap();
     let publisher = Publisher::connect(place, "pair", hello, options(), in_30_s()).unwrap();
     (claim, subscriber, publisher)
 }
@@ -200,7 +200,7 @@ fn a_loader_starts_again_where_the_trainer_is() {
     drop(subscriber.next(0, in_30_s()).unwrap());
     drop(publisher);
     drop(subscriber);
-    let mut subscriber = claim.subscribe(0, 1, SLOTS, in_30_s()).unwrap();
+    let mut subscriber = claim.subscribe(0, 1, in_30_s()).unwrap();
     let mut publisher = Publisher::connect(&place, "pair", &hello, options(), in_30_s()).unwrap();
     publish(&mut publisher, &hello, 1);
     assert_eq!(subscriber.next(1, in_30_s()).unwrap().view().unwrap().clip_ids(), [1, 1]);
@@ -259,13 +259,13 @@ fn a_loader_without_a_trainer_says_so() {
 #[test]
 fn too_little_shared_memory_is_said_before_anything_is_made() {
     let (_folder, place) = place();
-    let huge = BatchShape { clips: 1 << 14, height: 1000, width: 500, ..small() };
+    let huge = BatchShape { clips: 1 << 13, height: 1000, width: 1000, ..small() };
     let claim = Claim::take(&place, "huge", in_30_s()).unwrap();
-    let slots = 4096;
-    let _subscriber = claim.subscribe(0, 1, 2, in_30_s()).unwrap();
+    let slots = crate::MAX_SLOTS;
+    let _subscriber = claim.subscribe(0, 1, in_30_s()).unwrap();
     let options = PublisherOptions { slots, ..options() };
     match Publisher::connect(&place, "huge", &hello(huge), options, in_30_s()) {
-        Err(ShmError::NoRoom { needed, available, slots: 4096, .. }) => assert!(needed > available),
+        Err(ShmError::NoRoom { needed, available, slots: 16, .. }) => assert!(needed > available),
         other => panic!("expected too little room, got {other:?}"),
     }
 }

@@ -64,8 +64,8 @@ pub struct DatasetInfo {
     pub content_hash: ContentHash,
     /// Hash of its schema.
     pub schema_hash: ContentHash,
-    /// Its weight in the mix; 0 to 1, all together 1.
-    pub weight: f64,
+    /// Share of the training clips that are drawn from it; all together 1.
+    pub share: f64,
     /// Its rows.
     pub rows: u64,
 }
@@ -112,7 +112,7 @@ pub struct ClipCounts {
     pub episodes: u64,
     /// Clips.
     pub clips: u64,
-    /// Clips left out because they touch a frame, state or action that is not valid.
+    /// Clips left out because they touch a frame or an action that is not valid.
     pub excluded: u64,
     /// Episodes that are too short for a clip.
     pub short_episodes: u64,

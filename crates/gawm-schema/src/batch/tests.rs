@@ -298,7 +298,7 @@ fn hello() -> Hello {
             path: "datasets/a".to_owned(),
             content_hash: ContentHash::of(b"content"),
             schema_hash: ContentHash::of(b"schema"),
-            weight: 1.0,
+            share: 1.0,
             rows: 1000,
         }],
         schema_hash: ContentHash::of(b"schema"),
