@@ -311,18 +311,21 @@ impl Tile<'_> {
             }
             let mut sums = [[V::zero(); VECTORS]; ROWS];
             let mut b = self.b;
-            for kk in 0..job.k {
+            let mut along = 0usize;
+            for _ in 0..job.k {
                 let mut columns = [V::zero(); VECTORS];
                 for (v, column) in columns.iter_mut().enumerate() {
                     *column = V::load(b.add(v * V::LANES));
                 }
-                b = b.wrapping_add(self.b_stride);
                 for (a, sums) in a.iter().zip(&mut sums) {
-                    let x = V::splat(*a.add(kk * a_k));
+                    let x = V::splat(*a.add(along));
                     for (sum, column) in sums.iter_mut().zip(&columns) {
                         *sum = V::mul_add(x, *column, *sum);
                     }
                 }
+                // Wrapping, since the steps after the last one may leave the operands; they are not read there.
+                b = b.wrapping_add(self.b_stride);
+                along = along.wrapping_add(a_k);
             }
             self.write::<V, ROWS, VECTORS>(&sums);
         }
