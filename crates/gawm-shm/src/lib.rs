@@ -36,6 +36,7 @@ mod domain;
 mod error;
 mod greeting;
 mod lock;
+mod mmap;
 mod place;
 mod publisher;
 mod room;
@@ -44,6 +45,7 @@ mod wait;
 
 pub use claim::Claim;
 pub use error::ShmError;
+pub use mmap::MappedFile;
 pub use place::{CleanReport, Place};
 pub use publisher::{Publisher, PublisherOptions, SlotMut};
 pub use subscriber::{MAX_SLOTS, Slot, Subscriber};

@@ -115,6 +115,15 @@ impl Subscriber {
         Ok(Slot { sample, layout: greeted.layout, header })
     }
 
+    /// Returns whether a message is queued: the next wait is then none.
+    ///
+    /// # Errors
+    /// [`ShmError::Transport`]
+    pub fn is_queued(&self) -> Result<bool, ShmError> {
+        let queued = self.port.has_samples();
+        queued.map_err(|e| ShmError::transport(&self.domain.service, "ask for slots")(&e))
+    }
+
     /// Returns whether the loader's process is alive.
     pub fn is_loader_alive(&self) -> bool {
         self.domain.is_loader_alive()
@@ -123,18 +132,32 @@ impl Subscriber {
     fn check(&self, n: u64, header: &SlotHeader) -> Result<(), ShmError> {
         let greeted = self.hello.as_ref().expect("checked after the hello");
         let loader = self.loader();
-        let expect = |field, expected: String, got: String| {
-            if expected == got { Ok(()) } else { Err(ShmError::Sequence { loader, field, expected, got }) }
-        };
         let Hello { schema_hash, ranks, sequence, .. } = &greeted.hello;
-        expect("schema hash", schema_hash.to_string(), header.schema_hash.to_string())?;
-        expect("stream hash", greeted.stream_hash.to_string(), header.stream_hash.to_string())?;
-        expect("position", n.to_string(), header.n.to_string())?;
-        let batch = sequence.batch(n).map_or("none".to_owned(), |batch| format!("{batch:?}"));
-        expect("batch", batch, format!("{:?}", header.batch))?;
-        let (loaders, got) = (self.loaders, (header.loader, header.loaders));
-        expect("loader", format!("{loader} of {loaders}"), format!("{} of {}", got.0, got.1))?;
-        expect("number of ranks", ranks.to_string(), header.ranks.to_string())
+        // Texts are made for messages only: this runs for every batch.
+        let fields: [(&'static str, bool, &dyn Fn() -> (String, String)); 6] = [
+            ("schema hash", header.schema_hash == *schema_hash, &|| {
+                (schema_hash.to_string(), header.schema_hash.to_string())
+            }),
+            ("stream hash", header.stream_hash == greeted.stream_hash, &|| {
+                (greeted.stream_hash.to_string(), header.stream_hash.to_string())
+            }),
+            ("position", header.n == n, &|| (n.to_string(), header.n.to_string())),
+            ("batch", sequence.batch(n) == Some(header.batch), &|| {
+                (format!("{:?}", sequence.batch(n)), format!("{:?}", header.batch))
+            }),
+            ("loader", (header.loader, header.loaders) == (loader, self.loaders), &|| {
+                let got = format!("{} of {}", header.loader, header.loaders);
+                (format!("{loader} of {}", self.loaders), got)
+            }),
+            ("number of ranks", header.ranks == *ranks, &|| (ranks.to_string(), header.ranks.to_string())),
+        ];
+        match fields.into_iter().find(|(_, is_right, _)| !is_right) {
+            Some((field, _, texts)) => {
+                let (expected, got) = texts();
+                Err(ShmError::Sequence { loader, field, expected, got })
+            }
+            None => Ok(()),
+        }
     }
 
     fn receive(

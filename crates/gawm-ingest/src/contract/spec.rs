@@ -24,6 +24,9 @@ pub struct Contract {
     pub max_gap_s: f64,
     /// How numbers are stored: `float64` (lossless for what logs hold) or `float32`.
     pub float: gawm_schema::FloatType,
+    /// How episodes lie in HDF5 and npz files; found from their columns by default.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub layout: Option<crate::tabular::Layout>,
     /// When rows are made.
     pub ticks: TicksSpec,
     /// What becomes of which topic, in the order of the columns.
@@ -47,6 +50,7 @@ impl Default for Contract {
             causal: Causal::Stamp,
             disorder_window_ms: 1000.0,
             max_gap_s: 5.0,
+            layout: None,
             ticks: TicksSpec::default(),
             stream: Vec::new(),
             episodes: EpisodesSpec::default(),

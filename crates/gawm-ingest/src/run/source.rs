@@ -1,20 +1,23 @@
-//! What a recording is read from: an MCAP file, or a table of rows in the form of one.
+//! What a recording is read from: an MCAP file, or rows in the form of one.
 
+use std::collections::BTreeMap;
 use std::io;
 use std::path::Path;
 use std::sync::Arc;
 
 use super::open_options;
 use crate::contract::{CheckedContract, TickRule};
+use crate::lerobot::{self, LerobotError, LerobotRecording};
 use crate::log::{Block, BlockRef, Channel, Damage, Log, MetadataRecord, OpenLogError, SummaryCounts};
+use crate::rows::{RowRecording, Unavailable};
 use crate::tabular::{Limits, OpenTableError, RecordingError, TableRecording, open, sniff};
 
-/// One open file.
+/// One open file or folder.
 pub(crate) enum Source {
     /// An MCAP file.
     Log(Box<Log>),
-    /// HDF5 or npz.
-    Table(Box<TableRecording>),
+    /// HDF5, npz or a LeRobot folder.
+    Rows(Box<dyn RowRecording>),
 }
 
 /// Why a file is refused.
@@ -27,6 +30,9 @@ pub(crate) enum OpenError {
     /// It is a table that cannot be read.
     #[error(transparent)]
     Table(#[from] OpenTableError),
+    /// It is a LeRobot folder that cannot be read.
+    #[error(transparent)]
+    Lerobot(#[from] LerobotError),
     /// It is a table without episodes.
     #[error("{source}: {path:?}")]
     Recording {
@@ -49,6 +55,7 @@ impl OpenError {
         match self {
             OpenError::Log(error) => error.hint(),
             OpenError::Table(error) => error.hint().map(ToOwned::to_owned),
+            OpenError::Lerobot(error) => error.hint().map(ToOwned::to_owned),
             OpenError::Recording { source: RecordingError::Layout(error), .. } => {
                 error.hint().map(ToOwned::to_owned)
             }
@@ -62,8 +69,11 @@ impl OpenError {
 }
 
 impl Source {
-    /// Opens a file, told apart by content.
+    /// Opens a file or folder, told apart by content.
     pub(crate) fn open(path: &Path, contract: &CheckedContract) -> Result<Source, OpenError> {
+        if lerobot::is_dataset(path) {
+            return Ok(Source::Rows(Box::new(LerobotRecording::open(path)?)));
+        }
         // What cannot be read at all is the log's to report.
         if path.is_file() && sniff(path).is_ok_and(|format| format.is_some()) {
             let rate_hz = match (contract.written.ticks.fps, &contract.ticks) {
@@ -74,9 +84,9 @@ impl Source {
                 }
             };
             let table = open(path, &Limits::default())?;
-            let recording = TableRecording::try_new(table, None, rate_hz)
+            let recording = TableRecording::try_new(table, contract.written.layout.as_ref(), rate_hz)
                 .map_err(|source| OpenError::Recording { path: path.to_owned(), source })?;
-            return Ok(Source::Table(Box::new(recording)));
+            return Ok(Source::Rows(Box::new(recording)));
         }
         Ok(Source::Log(Box::new(Log::open(path, &open_options(contract))?)))
     }
@@ -85,91 +95,102 @@ impl Source {
     pub(crate) fn as_log(&self) -> Option<&Log> {
         match self {
             Source::Log(log) => Some(log),
-            Source::Table(_) => None,
+            Source::Rows(_) => None,
         }
     }
 
     pub(crate) fn path(&self) -> &Path {
         match self {
             Source::Log(log) => log.path(),
-            Source::Table(table) => table.table().path(),
+            Source::Rows(rows) => rows.path(),
         }
     }
 
     pub(crate) fn file_bytes(&self) -> u64 {
         match self {
             Source::Log(log) => log.file_bytes(),
-            // A file that is gone since has been hashed before, and then the run has failed.
-            Source::Table(table) => std::fs::metadata(table.table().path()).map_or(0, |m| m.len()),
+            Source::Rows(rows) => rows.file_bytes(),
         }
     }
 
     pub(crate) fn content_hash(&self) -> io::Result<[u8; 32]> {
         match self {
             Source::Log(log) => log.content_hash(),
-            Source::Table(table) => table.content_hash(),
+            Source::Rows(rows) => rows.content_hash(),
         }
     }
 
-    /// Returns what the writer said of itself.
-    pub(crate) fn notes(&self) -> [(&'static str, &str); 2] {
+    /// Returns what the writer said of itself, and what is worth keeping of columns.
+    pub(crate) fn notes(&self) -> BTreeMap<String, String> {
         match self {
-            Source::Log(log) => [("library", log.library()), ("profile", log.profile())],
-            Source::Table(table) => [("layout", table.episodes().layout.name()), ("profile", "")],
+            Source::Log(log) => [("library", log.library()), ("profile", log.profile())]
+                .into_iter()
+                .filter(|(_, value)| !value.is_empty())
+                .map(|(key, value)| (key.to_owned(), value.to_owned()))
+                .collect(),
+            Source::Rows(rows) => rows.notes(),
         }
     }
 
     pub(crate) fn channels(&self) -> Vec<Arc<Channel>> {
         match self {
             Source::Log(log) => log.channels().values().cloned().collect(),
-            Source::Table(table) => table.channels().to_vec(),
+            Source::Rows(rows) => rows.channels().to_vec(),
         }
     }
 
     pub(crate) fn metadata(&self) -> &[MetadataRecord] {
         match self {
             Source::Log(log) => log.metadata(),
-            Source::Table(table) => table.metadata(),
+            Source::Rows(rows) => rows.metadata(),
         }
     }
 
     pub(crate) fn damage(&self) -> &[Damage] {
         match self {
             Source::Log(log) => log.damage(),
-            Source::Table(table) => table.damage(),
+            Source::Rows(rows) => rows.damage(),
         }
     }
 
     pub(crate) fn summary_counts(&self) -> Option<&SummaryCounts> {
         match self {
             Source::Log(log) => log.summary_counts(),
-            Source::Table(_) => None,
+            Source::Rows(_) => None,
         }
     }
 
     pub(crate) fn blocks(&self) -> &[BlockRef] {
         match self {
             Source::Log(log) => log.blocks(),
-            Source::Table(table) => table.blocks(),
+            Source::Rows(rows) => rows.blocks(),
         }
     }
 
     pub(crate) fn read_block(&self, block: &BlockRef) -> Block {
         match self {
             Source::Log(log) => log.read_block(block),
-            Source::Table(table) => table.read_block(block),
+            Source::Rows(rows) => rows.read_block(block),
         }
     }
 
     /// Reads only these topics from now on, where that saves work.
     pub(crate) fn select(&mut self, topics: &[String]) {
-        if let Source::Table(table) = self {
-            table.select(topics.iter().cloned());
+        if let Source::Rows(rows) = self {
+            rows.select(topics);
         }
     }
 
     /// Returns whether the file lists its episodes itself.
     pub(crate) fn has_episodes(&self) -> bool {
-        matches!(self, Source::Table(_))
+        matches!(self, Source::Rows(_))
+    }
+
+    /// Returns the topics that are declared and have no values.
+    pub(crate) fn unavailable(&self) -> &[Unavailable] {
+        match self {
+            Source::Log(_) => &[],
+            Source::Rows(rows) => rows.unavailable(),
+        }
     }
 }

@@ -167,7 +167,9 @@ pub(crate) fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
             }),
         }
     }
-    for group in groups.iter_mut().filter(|group| group.kind == KindSpec::Rotvec && group.fields.len() % 3 != 0) {
+    for group in
+        groups.iter_mut().filter(|group| group.kind == KindSpec::Rotvec && group.fields.len() % 3 != 0)
+    {
         group.kind = KindSpec::Linear;
         "no three numbers of a rotation vector".clone_into(&mut group.reason);
     }

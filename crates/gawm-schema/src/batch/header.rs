@@ -105,11 +105,10 @@ impl SlotHeader {
             return Err(BatchError::Short { expected: SLOT_HEADER_BYTES, got });
         };
         let mut fields = Fields { bytes: &copy };
-        expect(
-            "magic",
-            &SLOT_MAGIC.escape_ascii().to_string(),
-            &fields.take::<8>().escape_ascii().to_string(),
-        )?;
+        let magic = fields.take();
+        if magic != SLOT_MAGIC {
+            return Err(wrong("magic", SLOT_MAGIC.escape_ascii(), magic.escape_ascii()));
+        }
         expect("version", &SLOT_VERSION, &fields.u32())?;
         expect("checksum", &ContentHash::of(&copy[..CHECKED_BYTES]), &checksum(&copy))?;
         expect("header length", &(SLOT_HEADER_BYTES as u32), &fields.u32())?;
