@@ -23,7 +23,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         None => {
             let folder = root().join("target/interop-tensorboard");
             std::fs::create_dir_all(&folder).with_context(|| format!("cannot make {}", folder.display()))?;
-            python::environment(&folder.join("venv"), &root().join("xtask/interop/tensorboard-requirements.txt"), &[])?
+            python::environment(
+                &folder.join("venv"),
+                &root().join("xtask/interop/tensorboard-requirements.txt"),
+                &[],
+            )?
         }
     };
     let output = Command::new(&interpreter)
@@ -34,6 +38,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let answer = String::from_utf8_lossy(&output.stdout);
     print!("{answer}");
     ensure!(output.status.success(), "tensorboard disagrees:\n{}", String::from_utf8_lossy(&output.stderr));
-    record("TensorBoard", &format!("Command: `cargo xtask interop tensorboard RUN`.\n\n```text\n{answer}```\n"))?;
+    record(
+        "TensorBoard",
+        &format!("Command: `cargo xtask interop tensorboard RUN`.\n\n```text\n{answer}```\n"),
+    )?;
     Ok(ExitCode::SUCCESS)
 }
