@@ -126,8 +126,9 @@ pub fn verify(bytes: &[u8]) -> Result<ImageHeader, ImageError> {
         FileFormat::Jpeg => {
             let (header, scan) = jpeg_header(bytes)?;
             let rest = bytes.get(scan..).unwrap_or(&[]);
-            // In coded data 0xff is followed by 0 or a restart marker, so this pair can only be the end.
-            if rest.windows(2).any(|pair| pair == [0xff, 0xd9]) {
+            // In coded data 0xff is followed by 0 or a restart marker, so this pair can only be the end. Most files end
+            // with it; a few have something behind it.
+            if rest.ends_with(&[0xff, 0xd9]) || rest.windows(2).any(|pair| pair == [0xff, 0xd9]) {
                 Ok(header)
             } else {
                 Err(damaged(FileFormat::Jpeg, "it has no end: the file is cut off"))

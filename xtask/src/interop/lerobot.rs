@@ -21,6 +21,9 @@ pub(crate) struct Arguments {
 const FIXTURES: &[(&str, &str, &str)] =
     &[("demo", "pipelines/demo.toml", "fixtures/mcap-explorer-demo/demo.mcap")];
 
+/// A log of the corpora that is ingested with the contract that `suggest` writes.
+const ARM_LOG: &str = "generated/arm_ros2_zstd.mcap";
+
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     let folder = root().join("target/interop-lerobot");
     std::fs::create_dir_all(&folder).with_context(|| format!("cannot make {}", folder.display()))?;
@@ -111,35 +114,50 @@ fn gawm_data(arguments: &[&str]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Ingests the fixtures with the real program and returns the datasets.
+/// Ingests the fixtures, and an arm's log where the corpora are there, with the real program; returns the datasets.
 fn ingest_fixtures(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    let cargo = std::env::var("CARGO").unwrap_or_else(|_| "cargo".to_owned());
     let mut datasets = Vec::new();
     for (name, contract, log) in FIXTURES {
-        let out = folder.join(name);
-        if out.exists() {
-            std::fs::remove_dir_all(&out).with_context(|| format!("cannot remove {}", out.display()))?;
+        datasets.push(ingest(&folder.join(name), Path::new(contract), Path::new(log))?);
+    }
+    match std::env::var_os("GAWM_SHARED") {
+        None => println!("skipped: GAWM_SHARED is not set, so only the fixtures are opened"),
+        Some(shared) => {
+            let log = root().join(shared).join("corpora").join(ARM_LOG);
+            // Without an edit, as a newcomer would.
+            let contract = folder.join("arm.toml");
+            let suggested = program(&[Path::new("suggest"), &log])?;
+            std::fs::write(&contract, suggested)
+                .with_context(|| format!("cannot write {}", contract.display()))?;
+            datasets.push(ingest(&folder.join("arm"), &contract, &log)?);
         }
-        let status = Command::new(&cargo)
-            .args([
-                "run",
-                "--release",
-                "--quiet",
-                "-p",
-                "gawm-ingest",
-                "--",
-                "run",
-                "--config",
-                contract,
-                "--out",
-            ])
-            .arg(&out)
-            .arg(log)
-            .current_dir(root())
-            .status()
-            .with_context(|| format!("cannot run {cargo}"))?;
-        ensure!(status.success(), "gawm-ingest on {log} failed ({status})");
-        datasets.push(out);
     }
     Ok(datasets)
+}
+
+/// Makes a dataset of a log.
+fn ingest(out: &Path, contract: &Path, log: &Path) -> anyhow::Result<PathBuf> {
+    if out.exists() {
+        std::fs::remove_dir_all(out).with_context(|| format!("cannot remove {}", out.display()))?;
+    }
+    program(&[Path::new("run"), Path::new("--config"), contract, Path::new("--out"), out, log])?;
+    Ok(out.to_owned())
+}
+
+/// Runs `gawm-ingest` and returns what it printed.
+fn program(arguments: &[&Path]) -> anyhow::Result<Vec<u8>> {
+    let cargo = std::env::var("CARGO").unwrap_or_else(|_| "cargo".to_owned());
+    let output = Command::new(&cargo)
+        .args(["run", "--release", "--quiet", "-p", "gawm-ingest", "--"])
+        .args(arguments)
+        .current_dir(root())
+        .output()
+        .with_context(|| format!("cannot run {cargo}"))?;
+    ensure!(
+        output.status.success(),
+        "gawm-ingest {arguments:?} failed ({}): {}",
+        output.status,
+        String::from_utf8_lossy(&output.stderr)
+    );
+    Ok(output.stdout)
 }
