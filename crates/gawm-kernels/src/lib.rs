@@ -1,2 +1,18 @@
 //! Fused operations with exact backward: pure slice functions under thin candle adapters.
+#![deny(unsafe_op_in_unsafe_fn)]
 
+mod simd;
+
+pub mod adamw;
+pub mod attention;
+pub mod gelu;
+pub mod gemm;
+pub mod norm;
+pub mod profile;
+pub mod vit;
+
+mod adapter;
+pub mod memory;
+
+pub use adapter::{GradientSink, VitEncoder};
+pub use simd::{Level, detect, level, limit_level};

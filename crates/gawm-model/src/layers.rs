@@ -43,6 +43,11 @@ impl Linear {
         Linear { weight, bias }
     }
 
+    /// Width of the results.
+    pub fn outputs(&self) -> Result<usize> {
+        self.weight.dim(0)
+    }
+
     /// Maps the last axis: [.., inputs] to [.., outputs].
     pub fn forward(&self, x: &Tensor, pass: &Pass) -> Result<Tensor> {
         let (outputs, inputs) = self.weight.dims2()?;

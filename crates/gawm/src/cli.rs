@@ -35,6 +35,8 @@ enum Verb {
     Ingest(Rest),
     /// Datasets: validate, stats, report, preview, edit (gawm-data)
     Data(Rest),
+    /// Clips from datasets into shared memory: run, bench, clean (gawm-loader)
+    Loader(Rest),
     /// Environments: collect logs of an expert (gawm-sim)
     Sim(Rest),
     /// Run a pipeline: the steps from logs to a report that are not up to date
@@ -99,6 +101,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     match cli.command {
         Verb::Ingest(rest) => gawm_ingest::cli::main(named("gawm ingest", rest)),
         Verb::Data(rest) => gawm_dataset::cli::run(named("gawm data", rest)),
+        Verb::Loader(rest) => gawm_loader::cli::main(named("gawm loader", rest)),
         Verb::Sim(rest) => gawm_sim::cli::main(named("gawm sim", rest)),
         Verb::Run(arguments) => run_pipeline(&arguments),
         Verb::Completions { shell } => {

@@ -6,6 +6,7 @@ use std::ops::ControlFlow;
 use gawm_schema::Wrap;
 
 use super::Suggestion;
+use super::commands::{Follower, adopt_kinds};
 use super::lag::{Following, Series, following};
 use super::survey::Survey;
 use crate::contract::{
@@ -31,7 +32,7 @@ pub(crate) fn refine(suggestion: &mut Suggestion, survey: &Survey, library: &Sch
 }
 
 /// The values of one stream, by column.
-type StreamSeries = BTreeMap<usize, Vec<Series>>;
+pub(crate) type StreamSeries = BTreeMap<usize, Vec<Series>>;
 
 /// Drops streams whose fields do not compile after all, with the reason.
 fn remove_unbindable(suggestion: &mut Suggestion, survey: &Survey, library: &SchemaLibrary) {
@@ -130,7 +131,7 @@ fn split_by_wrap(suggestion: &mut Suggestion, series: &StreamSeries) {
 }
 
 /// Returns the interval that angles are wrapped to: told by jumps of nearly a turn.
-fn wrap_of(values: &[f64]) -> Wrap {
+pub(crate) fn wrap_of(values: &[f64]) -> Wrap {
     use std::f64::consts::PI;
     let has_jump = values.windows(2).any(|pair| ((pair[1] - pair[0]).abs() - 2.0 * PI).abs() < 1.0);
     let (low, high) =
@@ -155,38 +156,46 @@ fn time_actions(suggestion: &mut Suggestion, survey: &Survey, series: &StreamSer
         .map(|stream| (stream.kind, stream.wrap, stream.unit.clone()))
         .collect();
     let tick_hz = suggestion.contract.ticks.rate_hz.unwrap_or(10.0);
+    let mut followers = BTreeMap::new();
     for (index, stream) in suggestion.contract.stream.iter_mut().enumerate() {
         if stream.role != Some(RoleSpec::Action) || stream.topic.is_none() {
             continue;
         }
         let columns = series.get(&index).map_or(&[][..], Vec::as_slice);
-        let found: Vec<(usize, Following)> = columns
+        let followed: Vec<Option<Follower>> = columns
             .iter()
-            .take(MAX_COLUMNS)
-            .filter_map(|column| best_state(column, &states, series))
+            .enumerate()
+            .map(|(at, column)| (at < MAX_COLUMNS).then(|| best_state(column, &states, series)).flatten())
             .collect();
         let reasons = &mut suggestion.stream_reasons[index];
         let topic = stream.topic.as_deref().and_then(|topic| survey.topics.get(topic));
         let rate_hz = topic.map_or(0.0, super::survey::Topic::rate_hz);
-        apply(stream, reasons, &found, columns.len(), &kinds, (rate_hz, tick_hz));
+        let found: Vec<(usize, Following)> =
+            followed.iter().flatten().map(|follower| (follower.stream, follower.following)).collect();
+        let is_position = apply(stream, reasons, &found, columns.len(), &kinds, (rate_hz, tick_hz));
+        if is_position && columns.len() <= MAX_COLUMNS {
+            followers.insert(index, followed);
+        }
     }
+    adopt_kinds(suggestion, &followers, series);
 }
 
 /// Returns the state column that follows a command best.
-fn best_state(command: &Series, states: &[usize], series: &StreamSeries) -> Option<(usize, Following)> {
-    let mut best: Option<(usize, Following)> = None;
-    for &state in states {
-        for column in &series[&state] {
-            if let Some(found) = following(command, column)
-                && best.is_none_or(|(_, other)| found.correlation > other.correlation)
+fn best_state(command: &Series, states: &[usize], series: &StreamSeries) -> Option<Follower> {
+    let mut best: Option<Follower> = None;
+    for &stream in states {
+        for (column, state) in series[&stream].iter().enumerate() {
+            if let Some(following) = following(command, state)
+                && best.is_none_or(|other| following.correlation > other.following.correlation)
             {
-                best = Some((state, found));
+                best = Some(Follower { stream, column, following });
             }
         }
     }
-    best.filter(|(_, found)| found.correlation >= MIN_CORRELATION)
+    best.filter(|best| best.following.correlation >= MIN_CORRELATION)
 }
 
+/// Sets offset and timing; returns whether the command may be one of positions.
 fn apply(
     stream: &mut StreamSpec,
     reasons: &mut Vec<String>,
@@ -194,7 +203,7 @@ fn apply(
     n_columns: usize,
     kinds: &[(KindSpec, Option<Wrap>, Option<String>)],
     (rate_hz, tick_hz): (f64, f64),
-) {
+) -> bool {
     let commands_per_tick = rate_hz / tick_hz;
     let name = stream.topic.clone().unwrap_or_default();
     let is_delta = super::names::is_delta(&name);
@@ -221,9 +230,6 @@ fn apply(
             "offset: the state follows this {what} command after {lag_ms:.1} ms (correlation of {} of {n_columns} columns at least {correlation:.2}), so it acts that much later",
             found.len()
         ));
-        if !is_velocity && !is_delta && stream.kind == KindSpec::Linear {
-            adopt_kind(stream, reasons, found, kinds);
-        }
     } else {
         reasons.push(
             "offset: no clear delay between this command and the state; 0 until you know better".to_owned(),
@@ -236,7 +242,8 @@ fn apply(
             reasons.push("unit: the velocity of joint angles".to_owned());
         }
     }
-    let Some(action) = &mut stream.action else { return };
+    let is_position = !is_delta && !is_velocity;
+    let Some(action) = &mut stream.action else { return is_position };
     if commands_per_tick >= 1.5 {
         action.timing = ActionTimingSpec::Window;
         let reduce = match (is_delta, is_velocity, stream.kind) {
@@ -255,22 +262,7 @@ fn apply(
     } else {
         reasons.push("timing: at most about one command per row: the one in force".to_owned());
     }
-}
-
-/// A position command that follows joint angles is one of joint angles.
-fn adopt_kind(
-    stream: &mut StreamSpec,
-    reasons: &mut Vec<String>,
-    found: &[(usize, Following)],
-    kinds: &[(KindSpec, Option<Wrap>, Option<String>)],
-) {
-    let angles = found.iter().filter(|(state, _)| kinds[*state].0 == KindSpec::Angle).count();
-    if angles == found.len() && stream.unit.is_none() && angles > 0 {
-        reasons.push(
-            "kind: its columns follow joint angles, but a command may hold others too, so it is left linear; say kind = \"angle\" if all are"
-                .to_owned(),
-        );
-    }
+    is_position
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@
 //! states hang together (`measure`, `lag`) and writes the contract with comments (`render`).
 
 mod clock;
+mod commands;
 mod episodes;
 mod fields;
 mod guess;
