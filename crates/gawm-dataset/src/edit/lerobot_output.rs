@@ -343,7 +343,7 @@ impl<'a> RowWriter<'a> {
         let finish = || {
             writer.finish()?;
             writer.sync()?;
-            Ok(writer.inner().sync()?)
+            Ok(writer.inner_mut().sync()?)
         };
         let finished: Result<(), parquet::errors::ParquetError> = {
             let mut finish = finish;
