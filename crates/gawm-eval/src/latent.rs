@@ -209,11 +209,10 @@ pub fn goal_frame(world: &dyn World, problem: &crate::problem::Problem) -> Resul
         return Ok(frame.as_ref().clone());
     }
     let mut environment = world.environment();
-    let state =
-        gawm_sim::State { system: problem.goal_system.clone(), goal: problem.state.goal.clone() };
-    environment
-        .set_state(&state)
-        .map_err(|error| EvaluateError::Candle(candle_core::Error::Msg(format!("goal of {}: {error}", problem.id))))?;
+    let state = gawm_sim::State { system: problem.goal_system.clone(), goal: problem.state.goal.clone() };
+    environment.set_state(&state).map_err(|error| {
+        EvaluateError::Candle(candle_core::Error::Msg(format!("goal of {}: {error}", problem.id)))
+    })?;
     let mut frame = Frame::default();
     environment.render(&mut frame);
     Ok(frame)

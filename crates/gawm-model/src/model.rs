@@ -117,6 +117,17 @@ impl WorldModel {
         self.pred_proj.forward(&x.reshape((b * t, d))?, pass)?.reshape((b, t, d)) // [B, T, D]
     }
 
+    /// The predictor, for callers that extend a [`Window`](crate::Window) token by token.
+    pub fn predictor(&self) -> &Predictor {
+        &self.predictor
+    }
+
+    /// Maps outputs of the predictor to latents: [B, T, D], kept.
+    pub fn project_prediction(&self, x: &Tensor, pass: &Pass) -> Result<Tensor> {
+        let (b, t, d) = x.dims3()?;
+        self.pred_proj.forward(&x.reshape((b * t, d))?, pass)?.reshape((b, t, d)) // [B, T, D]
+    }
+
     /// Reads the physical state of each frame from the latents (G): [B, T, D] to [B, T, S].
     ///
     /// # Errors

@@ -1,6 +1,10 @@
 //! The predictor: a causal transformer whose blocks are modulated by the actions (AdaLN-zero).
 
+mod incremental;
+
 use candle_core::{D, Tensor};
+
+pub use incremental::Window;
 
 use crate::Result;
 use crate::config::Architecture;

@@ -52,7 +52,9 @@ pub fn lines(
         let places: Vec<(f64, f64)> = line.points.iter().map(|(x, y)| frame.at(*x, *y)).collect();
         canvas.path(&places, color);
         if series.len() > 1 {
-            canvas.add(&format!("<rect x=\"{legend:.1}\" y=\"280\" width=\"12\" height=\"4\" fill=\"{color}\"/>"));
+            canvas.add(&format!(
+                "<rect x=\"{legend:.1}\" y=\"280\" width=\"12\" height=\"4\" fill=\"{color}\"/>"
+            ));
             canvas.text(legend + 16.0, 286.0, "start", "small", &line.name);
             legend += 30.0 + 6.2 * line.name.chars().count() as f64;
         }
@@ -66,7 +68,8 @@ pub fn bars(title: &str, label: &str, bars: &[Bar], most: f64) -> String {
     let mut canvas = Canvas::new(520.0, 72.0 + row * bars.len() as f64, title);
     let low = bars.iter().map(|bar| bar.value).fold(0.0, f64::min);
     let height = row * bars.len() as f64;
-    let frame = Frame { left: 150.0, top: 30.0, width: 300.0, height, x: (low.max(-most), most), y: (0.0, 1.0) };
+    let frame =
+        Frame { left: 150.0, top: 30.0, width: 300.0, height, x: (low.max(-most), most), y: (0.0, 1.0) };
     for tick in super::svg::ticks(frame.x) {
         let (x, _) = frame.at(tick, 0.0);
         canvas.line((x, 30.0), (x, 30.0 + height), "grid");
@@ -105,7 +108,8 @@ pub fn pictures(title: &str, pictures: &[(String, Vec<f64>, Vec<Option<f64>>)]) 
     for (index, (name, points, local)) in pictures.iter().enumerate() {
         let left = 40.0 + cell * index as f64;
         let column = |offset: usize| points.iter().copied().skip(offset).step_by(2);
-        let frame = Frame { left, top: 46.0, width: 170.0, height: 150.0, x: range(column(0)), y: range(column(1)) };
+        let frame =
+            Frame { left, top: 46.0, width: 170.0, height: 150.0, x: range(column(0)), y: range(column(1)) };
         canvas.text(left + 85.0, 38.0, "middle", "small", name);
         scatter(&mut canvas, &frame, points);
         let below = Frame {
@@ -151,8 +155,13 @@ fn scatter(canvas: &mut Canvas, frame: &Frame, points: &[f64]) {
 
 /// Returns a colour from violet (0) over green to yellow (1), even to the eye.
 fn time_color(share: f64) -> String {
-    const ANCHORS: [[f64; 3]; 5] =
-        [[68.0, 1.0, 84.0], [59.0, 82.0, 139.0], [33.0, 145.0, 140.0], [94.0, 201.0, 98.0], [253.0, 231.0, 37.0]];
+    const ANCHORS: [[f64; 3]; 5] = [
+        [68.0, 1.0, 84.0],
+        [59.0, 82.0, 139.0],
+        [33.0, 145.0, 140.0],
+        [94.0, 201.0, 98.0],
+        [253.0, 231.0, 37.0],
+    ];
     let place = share.clamp(0.0, 1.0) * 4.0;
     let index = (place as usize).min(3);
     let blend = place - index as f64;

@@ -163,10 +163,7 @@ pub trait Planner: Send + Sync {
 ///
 /// # Errors
 /// [`PlannerConfigError`] names a setting that cannot be searched with.
-pub fn planner(
-    config: &PlannerConfig,
-    space: &ActionSpace,
-) -> Result<Box<dyn Planner>, PlannerConfigError> {
+pub fn planner(config: &PlannerConfig, space: &ActionSpace) -> Result<Box<dyn Planner>, PlannerConfigError> {
     config.check()?;
     let noise = SeededNoise { seed: config.seed };
     Ok(match (config.compat, config.method) {
@@ -181,7 +178,8 @@ pub fn planner(
 /// Mean squared difference of consecutive actions of a sequence [L, A] of chunks of `frameskip` actions.
 fn roughness(sequence: &[f32], action_width: usize) -> f32 {
     let later = sequence.iter().skip(action_width);
-    let (sum, n) = sequence.iter().zip(later).fold((0.0, 0), |(sum, n), (a, b)| (sum + (b - a) * (b - a), n + 1));
+    let (sum, n) =
+        sequence.iter().zip(later).fold((0.0, 0), |(sum, n), (a, b)| (sum + (b - a) * (b - a), n + 1));
     if n == 0 { 0.0 } else { sum / n as f32 }
 }
 

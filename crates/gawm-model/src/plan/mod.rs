@@ -11,6 +11,7 @@ use candle_core::{D, Tensor};
 use crate::Result;
 use crate::model::WorldModel;
 use crate::pass::Pass;
+use crate::predictor::Window;
 
 pub use cem::{CemConfig, CemIteration, CemPlan, Noise, PlanError, SeededNoise, cem};
 
@@ -21,7 +22,9 @@ const ROWS_PER_BATCH: usize = 4096;
 ///
 /// `z` [N, H, D] are the latents of the last H real frames; `chunks` [N, H-1+L, A] starts with the H - 1 chunks executed
 /// between them, followed by the L chunks of the plan. Returns [N, L, D]: the latent after each chunk of the plan.
-/// The predictor sees a window of the last `history` latents; positions restart at 0 in every window.
+/// The predictor sees a window of the last `history` latents; positions restart at 0 in every window. What a window
+/// shares with the one before is computed once, which saves a third of the work of the published horizon. `pass` is an
+/// evaluation pass: there is no dropout.
 ///
 /// # Errors
 ///
@@ -37,12 +40,22 @@ pub fn rollout(model: &WorldModel, z: &Tensor, chunks: &Tensor, pass: &Pass) -> 
     }
     let history = model.architecture().config().predictor.history;
     let c = model.embed_actions(chunks, pass)?.detach(); // [N, H-1+L, D]
+    let modulations: Vec<Tensor> =
+        model.predictor().modulations(&c, pass)?.into_iter().map(|m| m.detach()).collect(); // per block [N, H-1+L, 6 D]
     let mut latents: Vec<Tensor> = (0..n_frames).map(|t| z.narrow(1, t, 1)).collect::<Result<_>>()?; // H x [N, 1, D]
+    let mut window = Window::default();
     for end in n_frames..=n_chunks {
         let start = end.saturating_sub(history);
-        let window = Tensor::cat(&latents[start..end], 1)?; // [N, up to history, D]
-        let predicted = model.predict(&window, &c.narrow(1, start, end - start)?, pass)?;
-        latents.push(predicted.narrow(1, end - start - 1, 1)?.detach()); // [N, 1, D]
+        // While a window grows from the first frame, its tokens keep their positions; when it slides, all are new.
+        let first = if start == 0 && end > n_frames { end - 1 } else { start };
+        if first == start {
+            window = Window::default();
+        }
+        let tokens = Tensor::cat(&latents[first..end], 1)?; // [N, 1 to history, D]
+        let part = |m: &Tensor| m.narrow(1, first, end - first)?.contiguous();
+        let modulations = modulations.iter().map(part).collect::<Result<Vec<_>>>()?;
+        let x = model.predictor().extend(&mut window, &tokens, &modulations, pass)?.detach(); // [N, 1, D]
+        latents.push(model.project_prediction(&x, pass)?.detach());
     }
     Tensor::cat(&latents[n_frames..], 1) // [N, L, D]
 }
