@@ -245,7 +245,9 @@ fn prepare(
         name => match name.strip_prefix("cuda:").and_then(|number| number.parse().ok()) {
             Some(number) => Device::new_cuda(number)?,
             None => {
-                return Err(UsageError(format!("--device: expected cpu, cuda or cuda:N, got {name:?}")).into());
+                return Err(
+                    UsageError(format!("--device: expected cpu, cuda or cuda:N, got {name:?}")).into()
+                );
             }
         },
     };

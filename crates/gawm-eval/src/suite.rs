@@ -295,6 +295,9 @@ pub fn run_suite(
         .collect()
 }
 
+/// Who acts, and how.
+type Contestant<'a> = (Solver, Box<dyn Agent + 'a>);
+
 /// All solvers on one set.
 struct Contest<'a> {
     world: &'a dyn World,
@@ -332,10 +335,10 @@ impl<'a> Contest<'a> {
         }
     }
 
-    fn agents(&self) -> Result<Vec<(Solver, Box<dyn Agent + 'a>)>, SuiteError> {
+    fn agents(&self) -> Result<Vec<Contestant<'a>>, SuiteError> {
         let environment = self.world.environment();
         let spec = environment.spec();
-        let mut agents: Vec<(Solver, Box<dyn Agent + 'a>)> = Vec::new();
+        let mut agents: Vec<Contestant<'a>> = Vec::new();
         if let Some(models) = self.models {
             let shuffled = models.shuffled.map(|run| (Solver::ShuffledActions, run));
             let untrained = self.untrained.map(|run| (Solver::Untrained, run));

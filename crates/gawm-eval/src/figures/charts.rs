@@ -99,13 +99,24 @@ pub fn bars(title: &str, label: &str, bars: &[Bar], most: f64) -> String {
     canvas.finish()
 }
 
+/// A trajectory to draw.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Picture {
+    /// Its name.
+    pub name: String,
+    /// Two components per row, [T, 2] row-major.
+    pub points: Vec<f64>,
+    /// Local straightening; a gap where there is none.
+    pub local: Vec<Option<f64>>,
+}
+
 /// Draws trajectories side by side: two components coloured by time, and local straightening below with its mean dashed.
 ///
-/// A picture is its name, its points [T, 2] row-major, and its local scores. Start is a circle, end a cross.
-pub fn pictures(title: &str, pictures: &[(String, Vec<f64>, Vec<Option<f64>>)]) -> String {
+/// Start is a circle, end a cross.
+pub fn pictures(title: &str, pictures: &[Picture]) -> String {
     let cell = 220.0;
     let mut canvas = Canvas::new(20.0 + cell * pictures.len().max(1) as f64, 330.0, title);
-    for (index, (name, points, local)) in pictures.iter().enumerate() {
+    for (index, Picture { name, points, local }) in pictures.iter().enumerate() {
         let left = 40.0 + cell * index as f64;
         let column = |offset: usize| points.iter().copied().skip(offset).step_by(2);
         let frame =
@@ -181,7 +192,10 @@ mod tests {
         assert!(svg.contains("t &amp; u") && svg.contains("a&lt;b") && !svg.contains("NaN"), "{svg}");
         let bar = Bar { label: "model".to_owned(), value: 0.5, interval: Some((0.4, 0.6)), kind: 0 };
         assert!(bars("rates", "success", &[bar], 1.0).contains("model"));
-        assert!(!pictures("empty", &[("e".to_owned(), Vec::new(), vec![None])]).contains("NaN"));
+        assert!(
+            !pictures("empty", &[Picture { name: "e".to_owned(), points: Vec::new(), local: vec![None] }])
+                .contains("NaN")
+        );
         assert!(!lines("none", ("x", "y"), &[], &[], None).contains("NaN"));
     }
 }

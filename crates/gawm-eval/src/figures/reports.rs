@@ -2,7 +2,7 @@
 
 use gawm_model::diagnostics::principal_components;
 
-use super::{Bar, Line, Page, bars, lines, pictures};
+use super::{Bar, Line, Page, Picture, bars, lines, pictures};
 use crate::compare::CompareTable;
 use crate::diagnose::{DiagnoseReport, Diagnosis};
 use crate::suite::{PlanReport, Rate, SetResult, Solver};
@@ -183,7 +183,7 @@ fn pca_figure(diagnosis: &Diagnosis) -> String {
         |(trajectory, geometry): (&crate::diagnose::Trajectory, &crate::diagnose::TrajectoryGeometry)| {
             let z = trajectory.strided(diagnosis.report.options.stride);
             let points = principal_components(&z, trajectory.latent_width, 2);
-            (trajectory.id.clone(), points, geometry.straightness.local.clone())
+            Picture { name: trajectory.id.clone(), points, local: geometry.straightness.local.clone() }
         };
     let all = diagnosis.trajectories.iter().zip(&diagnosis.geometries).take(PICTURES);
     pictures(

@@ -2,7 +2,7 @@
 
 use super::{
     ActionSpace, Deadline, Evaluator, NoiseSource, Plan, PlanSource, Planner, PlannerConfig, PlannerError,
-    Task,
+    Slopes, Task,
 };
 
 const BETA1: f32 = 0.9;
@@ -57,7 +57,7 @@ impl<N: NoiseSource> GradientPlanner<N> {
                 x.iter_mut().zip(bounds.iter().cycle()).for_each(clamp);
             }
             let found = evaluator.gradients(&[index], &x, self.config.horizon)?;
-            let (costs, gradients) = found.ok_or(PlannerError::NoGradient)?;
+            let Slopes { costs, gradients } = found.ok_or(PlannerError::NoGradient)?;
             let cheapest = (0..costs.len())
                 .filter(|&i| costs[i].is_finite())
                 .min_by(|&a, &b| costs[a].total_cmp(&costs[b]));

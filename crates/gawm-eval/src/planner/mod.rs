@@ -40,7 +40,7 @@ pub trait Evaluator: Sync {
     /// The dynamics cannot be computed at all.
     fn costs(&self, tasks: &[usize], candidates: &[f32], horizon: usize) -> Result<Vec<f32>, EvaluateError>;
 
-    /// Returns costs [`tasks`, N] and their gradients [`tasks`, N, L, A], or `None` where dynamics have no gradient.
+    /// Returns costs and their gradients, or `None` where dynamics have no gradient.
     ///
     /// # Errors
     /// As for [`costs`](Self::costs).
@@ -49,9 +49,18 @@ pub trait Evaluator: Sync {
         _tasks: &[usize],
         _candidates: &[f32],
         _horizon: usize,
-    ) -> Result<Option<(Vec<f32>, Vec<f32>)>, EvaluateError> {
+    ) -> Result<Option<Slopes>, EvaluateError> {
         Ok(None)
     }
+}
+
+/// Costs of candidates and which way they fall.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Slopes {
+    /// Costs [tasks, N].
+    pub costs: Vec<f32>,
+    /// Gradients of each cost by its own candidate, [tasks, N, L, A].
+    pub gradients: Vec<f32>,
 }
 
 /// Why costs cannot be computed.

@@ -38,10 +38,10 @@ impl Evaluator for Bowl {
         tasks: &[usize],
         candidates: &[f32],
         horizon: usize,
-    ) -> Result<Option<(Vec<f32>, Vec<f32>)>, EvaluateError> {
+    ) -> Result<Option<Slopes>, EvaluateError> {
         let costs = self.costs(tasks, candidates, horizon)?;
         let slope = |(index, x): (usize, &f32)| 2.0 * (x - CENTRE[index % 2]);
-        Ok(Some((costs, candidates.iter().enumerate().map(slope).collect())))
+        Ok(Some(Slopes { costs, gradients: candidates.iter().enumerate().map(slope).collect() }))
     }
 }
 
@@ -281,7 +281,7 @@ fn gradients_of_a_world_model_are_its_slopes() {
     }
     let evaluator = LatentEvaluator::new(&run.model, starts, None, goals, 4, weights);
     let x = Stream::new(4, "x", 0).normals(4 * 20);
-    let (costs, slopes) = evaluator.gradients(&[0], &x, 2).unwrap().unwrap();
+    let Slopes { costs, gradients: slopes } = evaluator.gradients(&[0], &x, 2).unwrap().unwrap();
     let again = evaluator.costs(&[0], &x, 2).unwrap();
     for (a, b) in costs.iter().zip(&again) {
         assert!((a - b).abs() <= 1e-4 * b.abs(), "{a} {b}");

@@ -203,10 +203,12 @@ pub(crate) fn train(data: &Path, run: &Path, training: &Training, log: &dyn Fn(u
     Ok(())
 }
 
+/// Frames, standardised states and actions of an episode.
+type Decoded = (Vec<Vec<u8>>, Vec<f32>, Vec<f32>);
+
 /// All training episodes in memory.
 struct ClipSource {
-    /// Frames, standardised states and actions of each episode.
-    episodes: Vec<(Vec<Vec<u8>>, Vec<f32>, Vec<f32>)>,
+    episodes: Vec<Decoded>,
     /// Episode and first row of each clip.
     clips: Vec<(usize, usize)>,
     size: usize,
