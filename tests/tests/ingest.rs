@@ -414,6 +414,53 @@ fn explain_shows_the_messages_behind_a_number() {
 }
 
 #[test]
+fn explain_goes_into_derived_actions() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    run(&demo_contract(), &out, &[&demo_log()], &[], 0);
+    let explain = |frame: &str| {
+        let output =
+            ingest(&["explain", text(&out), "0", frame, "action.position_x", "--log", text(&demo_log())]);
+        assert_eq!(code(&output), 0, "{}", stderr(&output));
+        stdout(&output)
+    };
+    let state = Dataset::open(&out).values("observation.state", "position_x");
+    let said = explain("5");
+    assert!(said.contains("derived from observation.state: next"), "{said}");
+    assert!(said.contains("\"position_x\" in frame 6"), "{said}");
+    assert!(said.contains(&format!("> {:?}  /odom in demo.mcap", state[6])), "{said}");
+    assert!(said.contains("encoding: gawm.action[0] \"position_x\" (identity of position_x)"), "{said}");
+    let said = explain("29");
+    assert!(said.contains("not valid") && said.contains("the one of frame 28 is repeated"), "{said}");
+    assert!(said.contains(&format!("> {:?}  /odom in demo.mcap", state[29])), "{said}");
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn results_that_cannot_be_written_are_an_error() {
+    let full = || std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    for args in [&["suggest", text(&demo_log())][..], &["inspect", text(&demo_log())]] {
+        let output = Command::new(program())
+            .args(args)
+            .stdout(full())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap()
+            .wait_with_output()
+            .unwrap();
+        assert_eq!(code(&output), 1, "{args:?}");
+        assert!(stderr(&output).contains("cannot write the result to stdout"), "{}", stderr(&output));
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    let args = ["run", "--config", "pipelines/demo.toml", "--report", "/no/such/folder/r.json", "--out"];
+    let output = ingest(&[&args[..], &[text(&out), text(&demo_log())]].concat());
+    assert_eq!(code(&output), 1);
+    assert!(stderr(&output).contains("/no/such/folder/r.json"), "{}", stderr(&output));
+    assert!(!out.exists(), "said before the work, not after it");
+}
+
+#[test]
 fn inspect_and_completions_answer() {
     let output = ingest(&["inspect", "--format", "json", text(&demo_log())]);
     assert_eq!(code(&output), 0);

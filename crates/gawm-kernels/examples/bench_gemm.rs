@@ -10,7 +10,15 @@ use gawm_kernels::gemm::{Epilogue, Lhs, Packed, Rhs, gemm};
 
 fn main() {
     println!("level {:?}, ceiling {:.1} GFLOP/s", gawm_kernels::level(), ceiling());
-    for [m, n, k] in [[257, 192, 192], [257, 768, 192], [257, 192, 768], [260, 64, 64], [260, 256, 64], [260, 64, 256], [48, 272, 64]] {
+    for [m, n, k] in [
+        [257, 192, 192],
+        [257, 768, 192],
+        [257, 192, 768],
+        [260, 64, 64],
+        [260, 256, 64],
+        [260, 64, 256],
+        [48, 272, 64],
+    ] {
         let (a, b) = (vec![0.5; m * k], vec![0.25; n * k]);
         let packed = Packed::of(&b, [k, n]);
         let mut c = vec![0.0; m * n];
@@ -23,10 +31,19 @@ fn main() {
         let (dy, mut dw) = (vec![0.5; m * n], vec![0.0; n * k]);
         let weight = rate(2 * m * n * k, || {
             let dy = Lhs { values: &dy, row_stride: 1, k_stride: n };
-            gemm([n, k, m], dy, Rhs::Rows { values: &a, stride: k }, &mut dw, k, Epilogue { accumulate: true, bias: None });
+            gemm(
+                [n, k, m],
+                dy,
+                Rhs::Rows { values: &a, stride: k },
+                &mut dw,
+                k,
+                Epilogue { accumulate: true, bias: None },
+            );
             black_box(&dw);
         });
-        println!("{m:>4} x {n:>4} x {k:>4}: forward {forward:>6.1} GFLOP/s, gradient of the weight {weight:>6.1}");
+        println!(
+            "{m:>4} x {n:>4} x {k:>4}: forward {forward:>6.1} GFLOP/s, gradient of the weight {weight:>6.1}"
+        );
     }
 }
 

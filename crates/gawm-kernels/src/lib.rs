@@ -9,6 +9,7 @@ pub mod gelu;
 pub mod gemm;
 pub mod norm;
 pub mod profile;
+pub mod rollout;
 pub mod vit;
 
 mod adapter;

@@ -142,7 +142,8 @@ fn stream(index: &Index, place: &Place, warmup: u64, stop: &AtomicBool) -> Resul
                 let cache = open_cache(index, stop)?;
                 let maker = BatchMaker::new(index, cache, loader, loaders)?;
                 let place = place.clone();
-                let options = ServeOptions { place, service, loader, loaders, start: 0, wait: PATIENCE };
+                let options =
+                    ServeOptions { place, service, token: None, loader, loaders, start: 0, wait: PATIENCE };
                 serve(index, &maker, &options, stop)
             }
         };

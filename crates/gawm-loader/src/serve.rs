@@ -19,6 +19,8 @@ pub struct ServeOptions {
     pub place: Place,
     /// The name of its service.
     pub service: String,
+    /// The token of the trainer that started this process, [`gawm_shm::Subscriber::token`]; `None` if started by hand.
+    pub token: Option<String>,
     /// The number of this loader.
     pub loader: u32,
     /// The number of loaders; this one makes the batches n with `n % loaders == loader`.
@@ -88,11 +90,12 @@ pub fn serve(
 
 fn connect(index: &Index, options: &ServeOptions, stop: &AtomicBool) -> Result<Publisher, ServeError> {
     let ServeOptions { loader, loaders, .. } = *options;
-    let shm = PublisherOptions { loader, loaders, slots: index.config.slots };
+    let (slots, token) = (index.config.slots, options.token.clone());
+    let shm = PublisherOptions { loader, loaders, slots, token };
     let start = Instant::now();
     loop {
         let deadline = Instant::now() + PATIENCE;
-        match Publisher::connect(&options.place, &options.service, index.hello(), shm, deadline) {
+        match Publisher::connect(&options.place, &options.service, index.hello(), shm.clone(), deadline) {
             Ok(publisher) => return Ok(publisher),
             Err(ShmError::NoTrainer { .. } | ShmError::LoaderInUse { .. })
                 if start.elapsed() < options.wait => {}

@@ -114,10 +114,10 @@ fn loader_program() -> Command {
     Command::new(env!("CARGO_BIN_EXE_gawm-loader"))
 }
 
-fn start_loader(data: &Path, place: &Place, loader: u32, start: u64) -> Child {
+fn start_loader(data: &Path, place: &Place, token: &str, loader: u32, start: u64) -> Child {
     let length = run_length();
     let mut command = loader_program();
-    command.args(["run", "--service", SERVICE, "--data"]).arg(data);
+    command.args(["run", "--service", SERVICE, "--token", token, "--data"]).arg(data);
     command.args(["--loader", &loader.to_string(), "--loaders", &LOADERS.to_string()]);
     command.args(["--start", &start.to_string(), "--total-steps", &length.total_steps.to_string()]);
     command.args(["--validate-every", &length.validate_every.to_string()]);
@@ -159,7 +159,7 @@ impl<'a> Trainer<'a> {
             self.restarts += 1;
         }
         let subscriber = self.claim.subscribe(loader, LOADERS, in_60_s()).unwrap();
-        let child = start_loader(self.data, self.place, loader, n);
+        let child = start_loader(self.data, self.place, subscriber.token(), loader, n);
         self.loaders.insert(loader, (subscriber, child));
     }
 
@@ -316,14 +316,14 @@ fn trainers_killed_at_any_moment_resume() {
 #[test]
 fn clean_leaves_the_living_alone() {
     let bench = Bench::new();
-    let trainer = Trainer::new(&bench.data, &bench.place, 0);
-    let mut trainer = trainer;
-    trainer.sequence();
+    let mut trainer = Trainer::new(&bench.data, &bench.place, 0);
+    // Both loaders have connected.
+    (0..2).for_each(|n| assert!(trainer.take_within(n, Duration::from_secs(60)).is_some()));
     let before = bench.shm_files();
     bench.clean();
     assert_eq!(bench.shm_files(), before);
     assert!(!before.is_empty());
-    assert!(trainer.take_within(0, Duration::from_secs(60)).is_some());
+    assert!(trainer.take_within(2, Duration::from_secs(60)).is_some());
     // A trainer that leaves early: its loaders notice and end with success.
     let Trainer { mut loaders, claim, .. } = trainer;
     let children: Vec<Child> = std::mem::take(&mut loaders).into_values().map(|(_, child)| child).collect();

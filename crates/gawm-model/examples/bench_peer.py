@@ -1,6 +1,6 @@
 """PyTorch peer of bench_step.rs: the same model from published modules, the same batch sizes, the same JSON lines.
 
-usage: bench_peer.py {step,encode,plan} [--preset tiny-14|nano] [--clips 8] [--repeats 3] [--threads 2] [--compile]
+usage: bench_peer.py {step,encode,plan} [--preset tiny-14|nano] [--clips 8: iterations of a plan] [--repeats 3] [--threads 2] [--compile]
 needs: stable-worldmodel==0.1.1, torch, transformers
 
 Every repeat is timed; a line has the smallest wall time and the smallest user CPU time of a repeat.
@@ -89,7 +89,6 @@ def main():
     p.add_argument("--repeats", type=int, default=3)
     p.add_argument("--threads", type=int, default=2)
     p.add_argument("--samples", type=int, default=300)
-    p.add_argument("--iterations", type=int, default=30)
     p.add_argument("--compile", action="store_true")
     a = p.parse_args()
     torch.set_num_threads(a.threads)
@@ -121,7 +120,7 @@ def main():
             m.predict = torch.compile(m.predict, dynamic=False)
 
         def work():
-            plan(m, size, a.samples, a.iterations)
+            plan(m, size, a.samples, a.clips)
     line = {"who": "torch-compile" if a.compile else "torch", "mode": a.mode, "preset": a.preset, "clips": a.clips,
             "threads": a.threads} | measure(a.repeats, work)
     line["peak_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024

@@ -1,7 +1,7 @@
 //! Times a training step, encoding, or a plan, with the shares of time of the fused operations.
 //!
 //! `cargo run --release -p gawm-model --example bench_step -- MODE [PRESET] [CLIPS] [REPEATS]`, where MODE is `step`,
-//! `encode` or `plan`; `bench_peer.py` prints the same lines for PyTorch. `RAYON_NUM_THREADS` sets the threads.
+//! `encode` or `plan` (where CLIPS is the number of iterations); `bench_peer.py` prints the same lines for PyTorch. `RAYON_NUM_THREADS` sets the threads.
 //! With `--profile` a further repeat is counted by the kernels: seconds of all threads and GFLOP/s per kind.
 //! A line has the smallest wall time and the smallest user CPU time of a repeat, after one repeat that is not counted.
 
@@ -52,7 +52,7 @@ fn main() -> anyhow::Result<()> {
             model.encode(&frames, &Pass::eval())?.detach();
             Ok(())
         })?,
-        "plan" => measure(repeats, profiled, || plan(&model, size))?,
+        "plan" => measure(repeats, profiled, || plan(&model, size, clips))?,
         other => bail!("unknown mode {other:?}: expected step, encode or plan"),
     };
     println!(
@@ -65,12 +65,12 @@ fn main() -> anyhow::Result<()> {
 }
 
 /// Plans from one frame to another with the published search.
-fn plan(model: &WorldModel, size: usize) -> anyhow::Result<()> {
+fn plan(model: &WorldModel, size: usize, iterations: usize) -> anyhow::Result<()> {
     let pair = normal("pair", &[1, 2, 3, size, size])?;
     let z = model.encode(&pair, &Pass::eval())?.detach().squeeze(0)?; // [2, D]
     let start = Start { latents: z.narrow(0, 0, 1)?, executed: None, goal: z.get(1)? };
     let mut noise = SeededNoise { seed: 1, plan: 0 };
-    plan_to_goal(model, &[start], &[None], &CemConfig::default(), &mut noise)?;
+    plan_to_goal(model, &[start], &[None], &CemConfig { iterations, ..CemConfig::default() }, &mut noise)?;
     Ok(())
 }
 

@@ -172,7 +172,7 @@ pub struct BatchNorm {
 
 impl BatchNorm {
     /// Added to the variance.
-    const EPSILON: f64 = 1e-5;
+    pub(crate) const EPSILON: f64 = 1e-5;
     /// Share of a new batch in the running statistics.
     const MOMENTUM: f64 = 0.1;
 

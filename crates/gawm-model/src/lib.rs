@@ -96,7 +96,7 @@ pub use objective::{Clips, Control, Losses, Objectives, Term, latent_losses, los
 pub use optimizer::{AdamW, AdamWConfig, Decay, Gradients, OptimizerError, StepReport};
 pub use parameters::{Init, ParameterError, ParameterSpec, Parameters, Specs};
 pub use pass::{Pass, Precision};
-pub use predictor::{Predictor, Window};
+pub use predictor::Predictor;
 pub use projector::Projector;
 pub use random::{Stream, permutation};
 pub use schedule::WarmupCosine;

@@ -63,7 +63,7 @@ impl Claim {
         // Held until the service is there, so that no loader sees half of it.
         let _lock = self.sweep(loader, deadline)?;
         let token = new_token()?;
-        let subscriber = Subscriber::open(domain.clone(), &token, loaders)?;
+        let subscriber = Subscriber::open(domain.clone(), token.clone(), loaders)?;
         domain.write_ready(&token)?;
         Ok(subscriber)
     }

@@ -8,7 +8,7 @@
 //! ```text
 //! trainer                                      loader k of K
 //! Claim::take(place, name)                     Publisher::connect(place, name, k, &hello, slots)
-//! claim.subscribe(k, K) ── ready file ───────> │
+//! claim.subscribe(k, K) ── token ────────────> │
 //! subscriber.hello(deadline) <──── hello ───── │
 //! subscriber.next(n, deadline) <── slot n ──── publisher.loan() ... publish()
 //! drop(slot) ────────────────────  credit ───> │

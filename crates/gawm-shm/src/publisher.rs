@@ -27,7 +27,7 @@ const PAGE_BYTES: usize = 4096;
 type Loan = SampleMutUninit<Ipc, [std::mem::MaybeUninit<Chunk>], ()>;
 
 /// How a loader connects.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PublisherOptions {
     /// The number of this loader.
     pub loader: u32,
@@ -36,6 +36,9 @@ pub struct PublisherOptions {
     /// Batches that may be unconsumed at a time, the one being made included; 1 to
     /// [`MAX_SLOTS`].
     pub slots: usize,
+    /// [`Subscriber::token`](crate::Subscriber::token) of the trainer that started this loader; `None` for a loader that was
+    /// started by hand, which takes any trainer of the name.
+    pub token: Option<String>,
 }
 
 /// Sends the batches of one loader.
@@ -64,6 +67,7 @@ impl Publisher {
     ///
     /// # Errors
     /// - [`ShmError::NoTrainer`] if there is none by the deadline
+    /// - [`ShmError::TrainerGone`] if the one with the token in `options` is gone or has given this loader up
     /// - [`ShmError::LoaderInUse`] if another loader of this number is alive
     /// - [`ShmError::NoRoom`] if the slots do not fit into shared memory
     /// - [`ShmError::Slots`] if there are none or more than [`MAX_SLOTS`]
@@ -77,6 +81,7 @@ impl Publisher {
         deadline: Instant,
     ) -> Result<Publisher, ShmError> {
         let PublisherOptions { loader, slots, .. } = options;
+        let wanted = options.token.as_deref();
         if !(1..=MAX_SLOTS).contains(&slots) {
             return Err(ShmError::Slots { got: slots });
         }
@@ -86,7 +91,7 @@ impl Publisher {
         let slot_bytes = layout.total_bytes().max(greeting::length(&json));
         room::check(slots, slot_bytes)?;
         let domain = service.domain(loader);
-        let (lock, token) = attach(&service, &domain, deadline)?;
+        let (lock, token) = attach(&service, &domain, wanted, deadline)?;
         let node = domain.node()?;
         let parts = open(&domain, node, &token, slots, slot_bytes)?;
         room::reserve(&domain, slots, slot_bytes)?;
@@ -259,16 +264,28 @@ impl SlotMut {
 }
 
 /// Takes the loader's lock at a moment when the trainer's side is open.
-fn attach(service: &ServicePlace, domain: &Domain, deadline: Instant) -> Result<(Lock, String), ShmError> {
+///
+/// A trainer opens its side before it starts a loader. So a loader that knows its trainer's token need not wait for it, and
+/// must not: one whose trainer was killed meanwhile would attach to the next trainer with a place in the run that is not
+/// the next one's.
+fn attach(
+    service: &ServicePlace,
+    domain: &Domain,
+    wanted: Option<&str>,
+    deadline: Instant,
+) -> Result<(Lock, String), ShmError> {
     let mut wait = Wait::until(deadline);
     loop {
         service.create()?;
         let lock = Lock::try_take(&domain.lock_path())?;
         let is_free = lock.is_some();
-        if let Some(lock) = lock
-            && let Some(token) = domain.read_ready()
-            && service.is_trainer_alive()
+        let open = domain.read_ready().filter(|_| service.is_trainer_alive());
+        if let Some(wanted) = wanted
+            && open.as_deref() != Some(wanted)
         {
+            return Err(ShmError::TrainerGone { name: service.name.clone() });
+        }
+        if let (Some(lock), Some(token)) = (lock, open) {
             return Ok((lock, token));
         }
         if !wait.again() {

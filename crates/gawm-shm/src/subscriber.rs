@@ -32,7 +32,8 @@ pub(crate) type Channel = PortFactory<Ipc, [Chunk], ()>;
 /// let in_10_s = || Instant::now() + Duration::from_secs(10);
 /// let claim = gawm_shm::Claim::take(&gawm_shm::Place::of_user(), "run-1", in_10_s())?;
 /// let mut subscriber = claim.subscribe(0, 1, in_10_s())?;
-/// // ... start the loader: gawm-loader run --service run-1 --loader 0 --loaders 1 --start 0 ...
+/// let token = subscriber.token().to_owned();
+/// // ... start the loader: gawm-loader run --service run-1 --token TOKEN --loader 0 --loaders 1 --start 0 ...
 /// let hello = subscriber.hello(in_10_s())?.clone();
 /// for n in 0..hello.sequence.batches() {
 ///     let slot = subscriber.next(n, in_10_s())?;
@@ -49,6 +50,7 @@ pub struct Subscriber {
     _channel: Channel,
     _node: Node<Ipc>,
     domain: Domain,
+    token: String,
     loaders: u32,
     hello: Option<Greeted>,
 }
@@ -61,17 +63,25 @@ struct Greeted {
 }
 
 impl Subscriber {
-    pub(crate) fn open(domain: Domain, token: &str, loaders: u32) -> Result<Subscriber, ShmError> {
+    pub(crate) fn open(domain: Domain, token: String, loaders: u32) -> Result<Subscriber, ShmError> {
         let node = domain.node()?;
-        let channel = create_channel(&node, &domain.service, token)?;
+        let channel = create_channel(&node, &domain.service, &token)?;
         let port = channel.subscriber_builder().buffer_size(MAX_SLOTS).create();
         let port = port.map_err(|e| ShmError::transport(&domain.service, "subscribe")(&e))?;
-        Ok(Subscriber { port, _channel: channel, _node: node, domain, loaders, hello: None })
+        Ok(Subscriber { port, _channel: channel, _node: node, domain, token, loaders, hello: None })
     }
 
     /// Returns the number of the loader.
     pub fn loader(&self) -> u32 {
         self.domain.loader
+    }
+
+    /// Returns what identifies this subscriber among all of the name, ever.
+    ///
+    /// A trainer gives it to the loader that it starts (`gawm-loader run --token`). Without it a loader whose trainer is
+    /// killed before it has connected could attach to the next trainer, which is at another place of the run.
+    pub fn token(&self) -> &str {
+        &self.token
     }
 
     /// Waits for the loader's introduction; later calls return it at once.

@@ -89,7 +89,7 @@ fn header(hello: &Hello, n: u64) -> SlotHeader {
 const SLOTS: usize = 3;
 
 fn options() -> PublisherOptions {
-    PublisherOptions { loader: 0, loaders: 1, slots: SLOTS }
+    PublisherOptions { loader: 0, loaders: 1, slots: SLOTS, token: None }
 }
 
 /// A trainer's and a loader's side in one process.
@@ -246,6 +246,22 @@ fn names_and_numbers_are_taken_once() {
     for name in ["", "a/b", "..", ".hidden", "ü", &"x".repeat(65)] {
         assert!(matches!(Claim::take(&place, name, now()), Err(ShmError::BadName { .. })), "{name}");
     }
+}
+
+#[test]
+fn a_loader_of_another_trainer_leaves() {
+    let (_folder, place) = place();
+    let claim = Claim::take(&place, "pair", in_30_s()).unwrap();
+    let earlier = claim.subscribe(0, 1, in_30_s()).unwrap().token().to_owned();
+    let connect = |token: &str| {
+        let options = PublisherOptions { token: Some(token.to_owned()), ..options() };
+        Publisher::connect(&place, "pair", &hello(small()), options, in_30_s())
+    };
+    // Its subscriber is gone, then there is a newer one.
+    assert!(matches!(connect(&earlier), Err(ShmError::TrainerGone { .. })));
+    let subscriber = claim.subscribe(0, 1, in_30_s()).unwrap();
+    assert!(matches!(connect(&earlier), Err(ShmError::TrainerGone { .. })));
+    assert!(connect(subscriber.token()).is_ok());
 }
 
 #[test]

@@ -153,8 +153,6 @@ fn foreign_by_name(path: &Path) -> Option<Foreign> {
     let foreign = [
         (".bag", Foreign::RosBag1),
         (".db3", Foreign::Sqlite),
-        (".mcap.zstd", Foreign::Compressed { name: "zstd" }),
-        (".mcap.zst", Foreign::Compressed { name: "zstd" }),
         (".mcap.gz", Foreign::Compressed { name: "gzip" }),
         (".mcap.lz4", Foreign::Compressed { name: "lz4" }),
         (".db3.zstd", Foreign::Sqlite),
@@ -166,7 +164,7 @@ fn foreign_by_name(path: &Path) -> Option<Foreign> {
 fn grouped(files: &[PathBuf]) -> Vec<(String, Vec<PathBuf>)> {
     let mut numbered: BTreeMap<String, BTreeMap<u64, PathBuf>> = BTreeMap::new();
     let mut groups = Vec::new();
-    for path in files.iter().filter(|path| path.extension().is_some_and(|ending| ending == "mcap")) {
+    for path in files.iter().filter(|path| is_log(path)) {
         match split_number(path) {
             // `x_1.mcap` and `x_01.mcap` would be the same part; the second is one of its own.
             Some((stem, number)) if !numbered.get(&stem).is_some_and(|parts| parts.contains_key(&number)) => {
@@ -188,6 +186,12 @@ fn grouped(files: &[PathBuf]) -> Vec<(String, Vec<PathBuf>)> {
     groups
 }
 
+/// Tells a log by its name; rosbag2 may have compressed it as a whole.
+fn is_log(path: &Path) -> bool {
+    let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    [".mcap", ".mcap.zstd", ".mcap.zst"].iter().any(|ending| name.ends_with(ending))
+}
+
 /// Tells a table by its name: other files of a folder are not opened.
 fn is_table(path: &Path) -> bool {
     path.extension().is_some_and(|ending| ["h5", "hdf5", "npz"].iter().any(|known| ending == *known))
@@ -195,7 +199,8 @@ fn is_table(path: &Path) -> bool {
 
 /// Splits `name_12.mcap` into `name` and 12.
 fn split_number(path: &Path) -> Option<(String, u64)> {
-    let (stem, digits) = path.file_stem()?.to_str()?.rsplit_once('_')?;
+    let stem = path.file_name()?.to_str()?.split(".mcap").next()?;
+    let (stem, digits) = stem.rsplit_once('_')?;
     let is_number = !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit());
     Some((stem.to_owned(), digits.parse().ok().filter(|_| is_number)?))
 }

@@ -18,6 +18,7 @@ mod session;
 mod sink;
 mod source;
 mod unavailable;
+mod unpack;
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, VecDeque};
 use gawm_schema::{FloatType, Kind, Role, rotation};
 
 use super::bind::Binding;
-use super::block::{DecodedBlock, DecodedMessage};
+use super::block::{DecodedBlock, DecodedMessage, Row};
 use super::picture::Picture;
 use super::plan::Plans;
 use super::report::Counts;
@@ -18,6 +18,9 @@ use crate::log::Damage;
 
 /// This many messages in a row of one topic, all before the disorder window, mean that its clock was reset.
 const RESET_MESSAGES: usize = 3;
+
+/// Image bytes that may wait for the disorder window to pass.
+const MAX_IMAGE_BYTES: usize = 192 << 20;
 
 /// Everything that is fixed for a recording.
 pub(crate) struct SessionRules<'a> {
@@ -50,6 +53,8 @@ pub(crate) struct Session<'a, 's> {
     reordered: u64,
     not_in_message: BTreeMap<String, u64>,
     unclosed: u64,
+    /// The disorder window where images had to leave memory earlier.
+    shortest_window_ns: i64,
     /// Samples that cannot be used, by stream and what is wrong with them.
     non_finite: BTreeMap<(usize, &'static str), u64>,
     /// Values of a sample on their way to the aligner.
@@ -124,6 +129,7 @@ impl<'a, 's> Session<'a, 's> {
             reordered: 0,
             not_in_message: BTreeMap::new(),
             unclosed: 0,
+            shortest_window_ns: i64::MAX,
             non_finite: BTreeMap::new(),
             scratch: Vec::new(),
             samples: vec![0; rules.rule.streams.len()],
@@ -197,12 +203,27 @@ impl<'a, 's> Session<'a, 's> {
                 let name = self.rules.plans.topics[*topic].topic.clone();
                 self.reset_clock(&name)?;
             }
-            self.take_message(message, &block.values);
+            self.take_message(message, &block.rows, &block.values);
         }
         let window = self.rules.contract.disorder_window_ns;
         let complete = complete_log_ns.or(self.newest_log_ns);
         if let Some(complete) = complete {
             self.advance(complete.saturating_sub(window))?;
+            self.limit_images(complete, window)?;
+        }
+        Ok(())
+    }
+
+    /// Makes rows before the disorder window is over, if its images take too much memory.
+    fn limit_images(&mut self, complete_ns: i64, window_ns: i64) -> Result<(), Stop> {
+        for eighth in 1..=8 {
+            let held_bytes: usize = self.aligner.images().map(Picture::held_bytes).sum();
+            if held_bytes <= MAX_IMAGE_BYTES {
+                break;
+            }
+            let left_ns = window_ns - window_ns / 8 * eighth;
+            self.shortest_window_ns = self.shortest_window_ns.min(left_ns);
+            self.advance(complete_ns.saturating_sub(left_ns))?;
         }
         Ok(())
     }
@@ -221,6 +242,14 @@ impl<'a, 's> Session<'a, 's> {
             self.warn(format!(
                 "{topic}: {count} messages hold none of the mapped elements, and were passed over"
             ));
+        }
+        if self.shortest_window_ns < i64::MAX {
+            let text = format!(
+                "the images of disorder_window_ms take over {} MB, so the window was cut to {:.0} ms where needed: messages that come later than that are lost as beyond_disorder_window",
+                MAX_IMAGE_BYTES >> 20,
+                self.shortest_window_ns as f64 / 1e6
+            );
+            self.warn(text);
         }
         if self.unclosed > 0 {
             let text = format!(
@@ -308,7 +337,7 @@ impl<'a, 's> Session<'a, 's> {
         }
     }
 
-    fn take_message(&mut self, message: DecodedMessage, values: &[f64]) {
+    fn take_message(&mut self, mut message: DecodedMessage, rows: &[Row], values: &[f64]) {
         let rules = self.rules;
         let name = rules.plans.topics[message.topic].topic.as_str();
         self.counts.read(name, 1);
@@ -332,14 +361,23 @@ impl<'a, 's> Session<'a, 's> {
             Arrival::OutOfOrder => self.reordered += 1,
             Arrival::InOrder => {}
         }
-        if let Some(loss) = &message.loss {
+        if let Some(loss) = message.loss() {
             return self
                 .counts
                 .lost(name, loss.reason, 1, || format!("offset {}: {}", message.offset, loss.detail));
         }
-        self.take_rows(&message, values, name);
-        self.take_picture(&message, name);
-        self.take_event(message, name);
+        self.take_rows(&message, message.rows(rows), values, name);
+        if let Some(extras) = message.take_extras() {
+            if let Some((picture, stamp_ns)) = extras.picture {
+                self.take_picture(&message, &picture, stamp_ns, name);
+            }
+            if let Some(info) = extras.camera_info {
+                self.camera_infos.entry(name.to_owned()).or_insert(info);
+            }
+            if let Some(event) = extras.event {
+                self.take_event(&message, &event, name);
+            }
+        }
     }
 
     fn times(&self, stream: usize, message: &DecodedMessage, stamp_ns: Option<i64>) -> SampleTime {
@@ -354,11 +392,11 @@ impl<'a, 's> Session<'a, 's> {
         SampleTime { key_ns, clock_ns, log_ns: message.log_ns, ordinal: self.ordinal }
     }
 
-    fn take_rows(&mut self, message: &DecodedMessage, values: &[f64], name: &str) {
+    fn take_rows(&mut self, message: &DecodedMessage, rows: &[Row], values: &[f64], name: &str) {
         let rules = self.rules;
         let topic = &rules.plans.topics[message.topic];
         let mut late = None;
-        for (group, (range, stamp_ns)) in topic.groups.iter().zip(&message.rows) {
+        for (group, (range, stamp_ns)) in topic.groups.iter().zip(rows) {
             if range.is_empty() {
                 *self.not_in_message.entry(name.to_owned()).or_default() += 1;
                 continue;
@@ -399,8 +437,13 @@ impl<'a, 's> Session<'a, 's> {
         });
     }
 
-    fn take_picture(&mut self, message: &DecodedMessage, name: &str) {
-        let Some((picture, stamp_ns)) = &message.picture else { return };
+    fn take_picture(
+        &mut self,
+        message: &DecodedMessage,
+        picture: &Picture,
+        stamp_ns: Option<i64>,
+        name: &str,
+    ) {
         let rules = self.rules;
         for &stream in &rules.plans.topics[message.topic].images {
             let size = picture.recorded_size();
@@ -414,7 +457,7 @@ impl<'a, 's> Session<'a, 's> {
                 });
                 return;
             }
-            let time = self.times(stream, message, *stamp_ns);
+            let time = self.times(stream, message, stamp_ns);
             if let Err(late) = self.aligner.push_image(stream, time, picture.clone()) {
                 self.count_late(name, message, late);
                 return;
@@ -422,17 +465,13 @@ impl<'a, 's> Session<'a, 's> {
         }
     }
 
-    fn take_event(&mut self, message: DecodedMessage, name: &str) {
-        if let Some(info) = message.camera_info {
-            self.camera_infos.entry(name.to_owned()).or_insert(*info);
-        }
-        let Some(event) = message.event else { return };
+    fn take_event(&mut self, message: &DecodedMessage, event: &serde_json::Value, name: &str) {
         if let EpisodeRule::Marker { topic, field, start, stop, clock } = &self.rules.contract.episodes
             && topic == name
         {
             let marks = Marks { field: field.clone(), start: start.clone(), stop: stop.clone() };
             let stamp_ns = match clock {
-                Clock::Field(path) => crate::episodes::value_at(&event, path)
+                Clock::Field(path) => crate::episodes::value_at(event, path)
                     .and_then(|value| value.as_f64())
                     .map(|value| if value.abs() < 1e12 { value * 1e9 } else { value })
                     .map(|ns| ns as i64),
@@ -443,11 +482,11 @@ impl<'a, 's> Session<'a, 's> {
                 (Clock::Publish, _) => message.publish_ns,
                 _ => message.log_ns,
             };
-            if let Some(mark) = marks.read(&event) {
+            if let Some(mark) = marks.read(event) {
                 self.marks.insert((time_ns, self.ordinal), mark);
             }
         }
-        self.sink.recording.take(name, &self.rules.label_fields, message.log_ns, &event);
+        self.sink.recording.take(name, &self.rules.label_fields, message.log_ns, event);
     }
 }
 

@@ -2,10 +2,11 @@
 
 use std::collections::BTreeMap;
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::open_options;
+use super::unpack::{UnpackError, is_packed, unpack};
 use crate::contract::{CheckedContract, TickRule};
 use crate::lerobot::{self, LerobotError, LerobotRecording};
 use crate::log::{Block, BlockRef, Channel, Damage, Log, MetadataRecord, OpenLogError, SummaryCounts};
@@ -16,6 +17,15 @@ use crate::tabular::{Limits, OpenTableError, RecordingError, TableRecording, ope
 pub(crate) enum Source {
     /// An MCAP file.
     Log(Box<Log>),
+    /// An MCAP file that was compressed as a whole: the file itself, and what it was unpacked into.
+    Packed {
+        /// The file as named.
+        path: PathBuf,
+        /// What it holds.
+        log: Box<Log>,
+        /// Removed when it is dropped.
+        _unpacked: tempfile::NamedTempFile,
+    },
     /// HDF5, npz or a LeRobot folder.
     Rows(Box<dyn RowRecording>),
 }
@@ -30,6 +40,9 @@ pub(crate) enum OpenError {
     /// It is a table that cannot be read.
     #[error(transparent)]
     Table(#[from] OpenTableError),
+    /// It is a compressed log that cannot be unpacked.
+    #[error(transparent)]
+    Unpack(#[from] UnpackError),
     /// It is a LeRobot folder that cannot be read.
     #[error(transparent)]
     Lerobot(#[from] LerobotError),
@@ -37,7 +50,7 @@ pub(crate) enum OpenError {
     #[error("{source}: {path:?}")]
     Recording {
         /// The file.
-        path: std::path::PathBuf,
+        path: PathBuf,
         /// What is wrong with it.
         source: RecordingError,
     },
@@ -45,7 +58,7 @@ pub(crate) enum OpenError {
     #[error("rows per second: expected ticks.fps or ticks.rate_hz in the contract, got neither: {path:?}")]
     NoRate {
         /// The file.
-        path: std::path::PathBuf,
+        path: PathBuf,
     },
 }
 
@@ -58,6 +71,9 @@ impl OpenError {
             OpenError::Lerobot(error) => error.hint().map(ToOwned::to_owned),
             OpenError::Recording { source: RecordingError::Layout(error), .. } => {
                 error.hint().map(ToOwned::to_owned)
+            }
+            OpenError::Unpack(_) => {
+                Some("unpack it yourself (zstd -d), or set TMPDIR to a folder with room".to_owned())
             }
             OpenError::Recording { .. } => None,
             OpenError::NoRate { .. } => Some(
@@ -88,13 +104,18 @@ impl Source {
                 .map_err(|source| OpenError::Recording { path: path.to_owned(), source })?;
             return Ok(Source::Rows(Box::new(recording)));
         }
+        if is_packed(path) {
+            let unpacked = unpack(path)?;
+            let log = Box::new(Log::open(unpacked.path(), &open_options(contract))?);
+            return Ok(Source::Packed { path: path.to_owned(), log, _unpacked: unpacked });
+        }
         Ok(Source::Log(Box::new(Log::open(path, &open_options(contract))?)))
     }
 
     /// Returns the MCAP file, if it is one.
     pub(crate) fn as_log(&self) -> Option<&Log> {
         match self {
-            Source::Log(log) => Some(log),
+            Source::Log(log) | Source::Packed { log, .. } => Some(log),
             Source::Rows(_) => None,
         }
     }
@@ -102,20 +123,21 @@ impl Source {
     pub(crate) fn path(&self) -> &Path {
         match self {
             Source::Log(log) => log.path(),
+            Source::Packed { path, .. } => path,
             Source::Rows(rows) => rows.path(),
         }
     }
 
     pub(crate) fn file_bytes(&self) -> u64 {
         match self {
-            Source::Log(log) => log.file_bytes(),
+            Source::Log(log) | Source::Packed { log, .. } => log.file_bytes(),
             Source::Rows(rows) => rows.file_bytes(),
         }
     }
 
     pub(crate) fn content_hash(&self) -> io::Result<[u8; 32]> {
         match self {
-            Source::Log(log) => log.content_hash(),
+            Source::Log(log) | Source::Packed { log, .. } => log.content_hash(),
             Source::Rows(rows) => rows.content_hash(),
         }
     }
@@ -123,53 +145,55 @@ impl Source {
     /// Returns what the writer said of itself, and what is worth keeping of columns.
     pub(crate) fn notes(&self) -> BTreeMap<String, String> {
         match self {
-            Source::Log(log) => [("library", log.library()), ("profile", log.profile())]
-                .into_iter()
-                .filter(|(_, value)| !value.is_empty())
-                .map(|(key, value)| (key.to_owned(), value.to_owned()))
-                .collect(),
+            Source::Log(log) | Source::Packed { log, .. } => {
+                [("library", log.library()), ("profile", log.profile())]
+                    .into_iter()
+                    .filter(|(_, value)| !value.is_empty())
+                    .map(|(key, value)| (key.to_owned(), value.to_owned()))
+                    .collect()
+            }
             Source::Rows(rows) => rows.notes(),
         }
     }
 
     pub(crate) fn channels(&self) -> Vec<Arc<Channel>> {
         match self {
-            Source::Log(log) => log.channels().values().cloned().collect(),
+            Source::Log(log) | Source::Packed { log, .. } => log.channels().values().cloned().collect(),
             Source::Rows(rows) => rows.channels().to_vec(),
         }
     }
 
     pub(crate) fn metadata(&self) -> &[MetadataRecord] {
         match self {
-            Source::Log(log) => log.metadata(),
+            Source::Log(log) | Source::Packed { log, .. } => log.metadata(),
             Source::Rows(rows) => rows.metadata(),
         }
     }
 
     pub(crate) fn damage(&self) -> &[Damage] {
         match self {
-            Source::Log(log) => log.damage(),
+            Source::Log(log) | Source::Packed { log, .. } => log.damage(),
             Source::Rows(rows) => rows.damage(),
         }
     }
 
     pub(crate) fn summary_counts(&self) -> Option<&SummaryCounts> {
         match self {
-            Source::Log(log) => log.summary_counts(),
+            Source::Log(log) | Source::Packed { log, .. } => log.summary_counts(),
             Source::Rows(_) => None,
         }
     }
 
     pub(crate) fn blocks(&self) -> &[BlockRef] {
         match self {
-            Source::Log(log) => log.blocks(),
+            Source::Log(log) | Source::Packed { log, .. } => log.blocks(),
             Source::Rows(rows) => rows.blocks(),
         }
     }
 
     pub(crate) fn read_block(&self, block: &BlockRef) -> Block {
         match self {
-            Source::Log(log) => log.read_block(block),
+            Source::Log(log) | Source::Packed { log, .. } => log.read_block(block),
             Source::Rows(rows) => rows.read_block(block),
         }
     }
@@ -189,7 +213,7 @@ impl Source {
     /// Returns the topics that are declared and have no values.
     pub(crate) fn unavailable(&self) -> &[Unavailable] {
         match self {
-            Source::Log(_) => &[],
+            Source::Log(_) | Source::Packed { .. } => &[],
             Source::Rows(rows) => rows.unavailable(),
         }
     }

@@ -63,8 +63,9 @@ fn read(suggestion: &Suggestion, survey: &Survey, library: &SchemaLibrary) -> Op
     let plans = Plans::new(&binding, &[], &[], library);
     let mut all: StreamSeries = BTreeMap::new();
     let _: ControlFlow<()> = survey.first.read(&plans, 1, |_, block| {
-        for message in block.messages.iter().filter(|message| message.loss.is_none()) {
-            for (group, (range, stamp_ns)) in plans.topics[message.topic].groups.iter().zip(&message.rows) {
+        for message in block.messages.iter().filter(|message| message.loss().is_none()) {
+            let rows = message.rows(&block.rows);
+            for (group, (range, stamp_ns)) in plans.topics[message.topic].groups.iter().zip(rows) {
                 if range.is_empty() {
                     continue;
                 }
@@ -156,28 +157,68 @@ fn time_actions(suggestion: &mut Suggestion, survey: &Survey, series: &StreamSer
         .map(|stream| (stream.kind, stream.wrap, stream.unit.clone()))
         .collect();
     let tick_hz = suggestion.contract.ticks.rate_hz.unwrap_or(10.0);
-    let mut followers = BTreeMap::new();
-    for (index, stream) in suggestion.contract.stream.iter_mut().enumerate() {
-        if stream.role != Some(RoleSpec::Action) || stream.topic.is_none() {
+    let mut followers: BTreeMap<usize, Vec<Option<Follower>>> = BTreeMap::new();
+    // The values of a message act at the same time, whichever streams they were shared out to.
+    let mut lags_of: BTreeMap<String, Vec<f64>> = BTreeMap::new();
+    for (index, stream) in suggestion.contract.stream.iter().enumerate() {
+        let Some(topic) = stream.topic.clone().filter(|_| stream.role == Some(RoleSpec::Action)) else {
             continue;
-        }
+        };
         let columns = series.get(&index).map_or(&[][..], Vec::as_slice);
         let followed: Vec<Option<Follower>> = columns
             .iter()
             .enumerate()
             .map(|(at, column)| (at < MAX_COLUMNS).then(|| best_state(column, &states, series)).flatten())
             .collect();
-        let reasons = &mut suggestion.stream_reasons[index];
-        let topic = stream.topic.as_deref().and_then(|topic| survey.topics.get(topic));
-        let rate_hz = topic.map_or(0.0, super::survey::Topic::rate_hz);
+        let lags = followed.iter().flatten().map(|follower| follower.following.lag_s * 1e3);
+        lags_of.entry(topic).or_default().extend(lags);
+        followers.insert(index, followed);
+    }
+    for (&index, followed) in &followers {
+        let stream = &mut suggestion.contract.stream[index];
+        let topic = stream.topic.clone().unwrap_or_default();
         let found: Vec<(usize, Following)> =
             followed.iter().flatten().map(|follower| (follower.stream, follower.following)).collect();
-        let is_position = apply(stream, reasons, &found, columns.len(), &kinds, (rate_hz, tick_hz));
-        if is_position && columns.len() <= MAX_COLUMNS {
-            followers.insert(index, followed);
-        }
+        let measured = Measured {
+            found: &found,
+            n_columns: followed.len(),
+            lags_ms: lags_of.get(&topic).map_or(&[][..], Vec::as_slice),
+            rate_hz: survey.topics.get(&topic).map_or(0.0, super::survey::Topic::rate_hz),
+            tick_hz,
+        };
+        apply(stream, &mut suggestion.stream_reasons[index], &measured, &kinds);
     }
+    followers.retain(|index, followed| {
+        is_position(&suggestion.contract.stream[*index], followed) && followed.len() <= MAX_COLUMNS
+    });
     adopt_kinds(suggestion, &followers, series);
+}
+
+/// What was measured of a command.
+struct Measured<'a> {
+    /// State streams that follow its columns, and how.
+    found: &'a [(usize, Following)],
+    n_columns: usize,
+    /// Delays of all columns of its topic.
+    lags_ms: &'a [f64],
+    /// Commands per second.
+    rate_hz: f64,
+    /// Rows per second.
+    tick_hz: f64,
+}
+
+fn is_velocity(stream: &StreamSpec, n_velocity: usize, n_found: usize) -> bool {
+    let name = stream.topic.as_deref().unwrap_or_default();
+    !super::names::is_delta(name)
+        && (2 * n_velocity > n_found || (n_found == 0 && super::names::is_velocity(name)))
+}
+
+/// Returns whether a command may be one of positions: neither of steps nor of velocities.
+fn is_position(stream: &StreamSpec, followed: &[Option<Follower>]) -> bool {
+    let found = followed.iter().flatten();
+    let n_velocity = found.clone().filter(|follower| follower.following.is_velocity).count();
+    !super::names::is_delta(stream.topic.as_deref().unwrap_or_default())
+        && !is_velocity(stream, n_velocity, found.count())
 }
 
 /// Returns the state column that follows a command best.
@@ -195,28 +236,25 @@ fn best_state(command: &Series, states: &[usize], series: &StreamSeries) -> Opti
     best.filter(|best| best.following.correlation >= MIN_CORRELATION)
 }
 
-/// Sets offset and timing; returns whether the command may be one of positions.
+/// Sets offset and timing.
 fn apply(
     stream: &mut StreamSpec,
     reasons: &mut Vec<String>,
-    found: &[(usize, Following)],
-    n_columns: usize,
+    measured: &Measured<'_>,
     kinds: &[(KindSpec, Option<Wrap>, Option<String>)],
-    (rate_hz, tick_hz): (f64, f64),
-) -> bool {
+) {
+    let Measured { found, n_columns, rate_hz, tick_hz, .. } = *measured;
     let commands_per_tick = rate_hz / tick_hz;
-    let name = stream.topic.clone().unwrap_or_default();
-    let is_delta = super::names::is_delta(&name);
+    let is_delta = super::names::is_delta(stream.topic.as_deref().unwrap_or_default());
     let n_velocity = found.iter().filter(|(_, following)| following.is_velocity).count();
-    let is_velocity =
-        !is_delta && (2 * n_velocity > found.len() || (found.is_empty() && super::names::is_velocity(&name)));
+    let is_velocity = is_velocity(stream, n_velocity, found.len());
     let is_told = 2 * found.len() >= n_columns.max(1);
     if is_told {
-        let mut lags: Vec<f64> = found.iter().map(|(_, following)| following.lag_s * 1e3).collect();
+        let mut lags = measured.lags_ms.to_vec();
         lags.sort_by(f64::total_cmp);
         // A step acts over the period after its command, so what is measured is later by half a period.
         let half_ms = if is_delta && rate_hz > 0.0 { 500.0 / rate_hz } else { 0.0 };
-        let lag_ms = (lags[lags.len() / 2] - half_ms).max(0.0);
+        let lag_ms = (lags.get(lags.len() / 2).copied().unwrap_or(0.0) - half_ms).max(0.0);
         let correlation = found.iter().map(|(_, f)| f.correlation).fold(f64::INFINITY, f64::min);
         let what = if is_delta {
             "step"
@@ -242,8 +280,7 @@ fn apply(
             reasons.push("unit: the velocity of joint angles".to_owned());
         }
     }
-    let is_position = !is_delta && !is_velocity;
-    let Some(action) = &mut stream.action else { return is_position };
+    let Some(action) = &mut stream.action else { return };
     if commands_per_tick >= 1.5 {
         action.timing = ActionTimingSpec::Window;
         let reduce = match (is_delta, is_velocity, stream.kind) {
@@ -262,7 +299,6 @@ fn apply(
     } else {
         reasons.push("timing: at most about one command per row: the one in force".to_owned());
     }
-    is_position
 }
 
 #[cfg(test)]

@@ -13,6 +13,7 @@ mod measure;
 mod names;
 mod render;
 mod rows;
+mod stream_names;
 mod survey;
 mod urdf;
 
@@ -96,6 +97,7 @@ pub fn suggest(
     }
     measure::refine(&mut suggestion, &survey, library);
     episodes::guess(&mut suggestion, &survey);
+    stream_names::name_streams(&mut suggestion.contract);
     Ok(suggestion)
 }
 

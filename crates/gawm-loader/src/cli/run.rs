@@ -17,6 +17,9 @@ pub(crate) struct RunArgs {
     /// Name of the trainer's service
     #[arg(long, value_name = "NAME", required_unless_present_any = ["print_config", "hello"])]
     service: Option<String>,
+    /// Token of the trainer that starts this loader; without it any trainer of the service is taken
+    #[arg(long, value_name = "TOKEN")]
+    token: Option<String>,
     /// Number of this loader, from 0
     #[arg(long, value_name = "K", default_value_t = 0)]
     loader: u32,
@@ -79,6 +82,7 @@ pub(crate) fn run(args: &RunArgs, global: &Global) -> Result<(), Failure> {
     let options = ServeOptions {
         place: global.place(),
         service: args.service.clone().unwrap_or_default(),
+        token: args.token.clone(),
         loader: args.loader,
         loaders,
         start: args.start,
