@@ -9,9 +9,7 @@ use gawm_sim::two_room::{Geometry, distance_px};
 use rayon::prelude::*;
 
 use crate::evaluate::{Agent, Decision, PlanRecord, View};
-use crate::planner::{
-    ActionSpace, EvaluateError, Evaluator, PlanSource, Planner, PlannerConfig, Task,
-};
+use crate::planner::{ActionSpace, EvaluateError, Evaluator, PlanSource, Planner, PlannerConfig, Task};
 use crate::world::World;
 
 /// Does nothing.
@@ -40,7 +38,11 @@ impl Agent for Random {
     fn decide(&self, views: &[View<'_>]) -> Vec<Result<Decision, String>> {
         let draw = |view: &View<'_>| {
             let mut stream = Stream::new(self.seed, &format!("random/{}", view.problem.id), view.step as u64);
-            one(self.bounds.iter().map(|(low, high)| (low + (high - low) * stream.uniform()) as f32).collect())
+            one(self
+                .bounds
+                .iter()
+                .map(|(low, high)| (low + (high - low) * stream.uniform()) as f32)
+                .collect())
         };
         views.iter().map(draw).collect()
     }
@@ -181,7 +183,8 @@ impl Dynamics for KnownDynamics {
     }
 
     fn bind<'a>(&'a self, views: &'a [View<'_>]) -> Result<Box<dyn Evaluator + 'a>, EvaluateError> {
-        let pair = |values: &[f64]| std::array::from_fn(|i| values.get(i).map_or(f32::NAN, |value| *value as f32));
+        let pair =
+            |values: &[f64]| std::array::from_fn(|i| values.get(i).map_or(f32::NAN, |value| *value as f32));
         let ends = views.iter().map(|view| (pair(&view.state.system), pair(&view.state.goal))).collect();
         Ok(Box::new(KnownEvaluator { dynamics: self, ends }))
     }
@@ -194,7 +197,11 @@ impl KnownEvaluator<'_> {
         let (mut at, goal) = self.ends[task];
         for action in sequence.chunks_exact(2) {
             let raw = std::array::from_fn(|i| (f64::from(action[i]) * space.scale[i] + space.mean[i]) as f32);
-            at = if *has_wall { geometry.next_position(at, raw) } else { geometry.next_position_without_wall(at, raw) };
+            at = if *has_wall {
+                geometry.next_position(at, raw)
+            } else {
+                geometry.next_position_without_wall(at, raw)
+            };
         }
         distance_px(at, goal).powi(2)
     }

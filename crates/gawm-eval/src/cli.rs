@@ -26,6 +26,11 @@ const EXIT_USAGE: u8 = 2;
 /// Finished, but an environment or a plan failed on a problem.
 const EXIT_LOSS: u8 = 3;
 
+/// Arguments that do not go together.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+struct UsageError(String);
+
 /// Evaluate world models: plan, diagnose, probe, compare
 #[derive(Debug, Parser)]
 #[command(name = "gawm-eval", version, max_term_width = 100)]
@@ -184,9 +189,13 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
 
 fn is_usage(error: &anyhow::Error) -> bool {
     let is_planner = |error: &ProgramError| {
-        matches!(error, ProgramError::NoData | ProgramError::Suite(SuiteError::Planner(_) | SuiteError::NoStateHead))
+        matches!(
+            error,
+            ProgramError::NoData | ProgramError::Suite(SuiteError::Planner(_) | SuiteError::NoStateHead)
+        )
     };
     error.is::<ConfigError>()
+        || error.is::<UsageError>()
         || error.is::<PlannerConfigError>()
         || matches!(error.downcast_ref(), Some(DiagnoseError::Option { .. }))
         || error.downcast_ref().is_some_and(is_planner)
@@ -195,7 +204,9 @@ fn is_usage(error: &anyhow::Error) -> bool {
 fn hint(error: &anyhow::Error) -> Option<&'static str> {
     if let Some(error) = error.downcast_ref::<RunError>() {
         return match error {
-            RunError::NoCheckpoint { .. } => Some("train longer: a checkpoint is written at the first validation"),
+            RunError::NoCheckpoint { .. } => {
+                Some("train longer: a checkpoint is written at the first validation")
+            }
             RunError::Schema { .. } => Some("hello.json and the checkpoint come from different runs"),
             RunError::Io { .. } => Some("give the folder that gawm-train wrote"),
             _ => None,
@@ -211,7 +222,10 @@ fn hint(error: &anyhow::Error) -> Option<&'static str> {
 }
 
 /// Reads the configuration, sets the threads, opens the device. `None` if the configuration was only printed.
-fn prepare(common: &Common, adjust: impl FnOnce(&mut EvalConfig)) -> anyhow::Result<Option<(EvalConfig, Device)>> {
+fn prepare(
+    common: &Common,
+    adjust: impl FnOnce(&mut EvalConfig),
+) -> anyhow::Result<Option<(EvalConfig, Device)>> {
     let mut config = config::read(common.config.as_deref(), &common.overrides)?;
     adjust(&mut config);
     if config.plan.planner.is_none() {
@@ -230,7 +244,11 @@ fn prepare(common: &Common, adjust: impl FnOnce(&mut EvalConfig)) -> anyhow::Res
         "cuda" => Device::new_cuda(0)?,
         name => match name.strip_prefix("cuda:").and_then(|number| number.parse().ok()) {
             Some(number) => Device::new_cuda(number)?,
-            None => anyhow::bail!("--device: expected cpu, cuda or cuda:N, got {name:?}"),
+            None => {
+                return Err(
+                    UsageError(format!("--device: expected cpu, cuda or cuda:N, got {name:?}")).into()
+                );
+            }
         },
     };
     Ok(Some((config, device)))
@@ -240,7 +258,8 @@ fn progress(quiet: bool, total: u64) -> ProgressBar {
     let is_shown = !quiet && std::io::stderr().is_terminal();
     let target = if is_shown { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
     let style = ProgressStyle::with_template("{msg:32} {bar:30} {pos}/{len}");
-    ProgressBar::with_draw_target(Some(total), target).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+    ProgressBar::with_draw_target(Some(total), target)
+        .with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
 fn run_plan(arguments: &PlanArgs) -> anyhow::Result<ExitCode> {
@@ -256,22 +275,26 @@ fn run_plan(arguments: &PlanArgs) -> anyhow::Result<ExitCode> {
     let shuffled = arguments.shuffled.as_ref().map(open).transpose()?;
     let data = match (&run, &arguments.data) {
         (Some(run), Some(path)) => Some(program::open_data(run, path, &plan.system_feature)?),
-        (None, Some(_)) => anyhow::bail!("--data needs a RUN, which says what its columns mean"),
+        (None, Some(_)) => {
+            return Err(UsageError("--data needs a RUN, which says what its columns mean".to_owned()).into());
+        }
         _ => None,
     };
     let folder = match (&arguments.out, &arguments.run) {
         (Some(out), _) => out.clone(),
         (None, Some(run)) => program::plan_folder(run, plan),
-        (None, None) => anyhow::bail!("--out is needed where no RUN is given"),
+        (None, None) => return Err(UsageError("--out is needed where no RUN is given".to_owned()).into()),
     };
     let bar = progress(arguments.common.quiet, plan.budget_steps as u64);
-    let result = program::plan(run.as_ref(), shuffled.as_ref(), data.as_ref(), plan, &|set, solver, step| {
-        bar.set_message(format!("{set}, {}", solver.name()));
-        bar.set_position(step as u64);
-    })?;
+    let result =
+        program::plan(run.as_ref(), shuffled.as_ref(), data.as_ref(), plan, &|set, solver, step| {
+            bar.set_message(format!("{set}, {}", solver.name()));
+            bar.set_position(step as u64);
+        })?;
     bar.finish_and_clear();
     program::write_plan(&folder, &result, plan.sheet_rows)?;
-    let text = toml::to_string(&toml::Table::from_iter([("eval".to_owned(), toml::Value::try_from(&config)?)]))?;
+    let text =
+        toml::to_string(&toml::Table::from_iter([("eval".to_owned(), toml::Value::try_from(&config)?)]))?;
     crate::output::write(&folder.join("config.toml"), text.as_bytes())?;
     print_plan(&result.report, &folder)?;
     if program::is_whole(&result.report) {
@@ -309,7 +332,8 @@ fn print_plan(report: &crate::suite::PlanReport, folder: &std::path::Path) -> st
 }
 
 fn run_compare(arguments: &CompareArgs) -> anyhow::Result<ExitCode> {
-    let folders = arguments.results.iter().map(|path| PlanFolder::read(path)).collect::<Result<Vec<_>, _>>()?;
+    let folders =
+        arguments.results.iter().map(|path| PlanFolder::read(path)).collect::<Result<Vec<_>, _>>()?;
     let table = compare(&folders);
     if let Some(out) = &arguments.out {
         program::write_comparison(out, &table)?;
@@ -324,9 +348,8 @@ fn run_diagnose(arguments: &DiagnoseArgs, only_probe: bool) -> anyhow::Result<Ex
         Some(path) => {
             let text = std::fs::read_to_string(path)
                 .map_err(|cause| ConfigError::Io { path: path.clone(), cause })?;
-            let earlier: DiagnoseReport = serde_json::from_str(&text).map_err(|error| ConfigError::Syntax {
-                place: path.display().to_string(),
-                message: error.to_string(),
+            let earlier: DiagnoseReport = serde_json::from_str(&text).map_err(|error| {
+                ConfigError::Syntax { place: path.display().to_string(), message: error.to_string() }
             })?;
             Some(earlier.trajectory_ids)
         }
@@ -368,10 +391,19 @@ fn print_diagnosis(report: &DiagnoseReport, folder: &std::path::Path) -> std::io
     if let Some(spread) = report.geometry.r95 {
         writeln!(out, "r95                    {:.1} +- {:.1}", spread.mean, spread.std)?;
     }
-    writeln!(out, "effective rank         {:.1}, RankMe {:.1}", report.rank.effective_rank, report.rank.rankme)?;
+    writeln!(
+        out,
+        "effective rank         {:.1}, RankMe {:.1}",
+        report.rank.effective_rank, report.rank.rankme
+    )?;
     for h in &report.rollouts.horizons {
-        let (chunks, ratio, sensitivity) = (h.chunks, h.against_identity, h.action_sensitivity);
-        writeln!(out, "prediction +{chunks}          {ratio:.3} of identity, shuffled actions x {sensitivity:.2}")?;
+        let [ratio, sensitivity] =
+            [h.against_identity, h.action_sensitivity].map(|value| value.unwrap_or(f64::NAN));
+        let chunks = h.chunks;
+        writeln!(
+            out,
+            "prediction +{chunks}          {ratio:.3} of identity, shuffled actions x {sensitivity:.2}"
+        )?;
     }
     for score in report.probe.scores.iter().filter(|score| score.chunks == 0) {
         let (r2, rmse, unit) = (score.r2.unwrap_or(f64::NAN), score.rmse, &score.unit);

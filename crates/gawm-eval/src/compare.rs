@@ -117,10 +117,11 @@ impl PlanFolder {
             let file = path.join(format!("outcomes-{}.jsonl", set.name));
             let mut solved = BTreeMap::new();
             for (number, line) in read_text(&file)?.lines().enumerate() {
-                let parsed: OutcomeLine = serde_json::from_str(line).map_err(|error| CompareError::Syntax {
-                    path: file.clone(),
-                    message: format!("line {}: {error}", number + 1),
-                })?;
+                let parsed: OutcomeLine =
+                    serde_json::from_str(line).map_err(|error| CompareError::Syntax {
+                        path: file.clone(),
+                        message: format!("line {}: {error}", number + 1),
+                    })?;
                 if parsed.solver == Solver::Model {
                     solved.insert(parsed.outcome.id, parsed.outcome.success_any);
                 }
@@ -192,12 +193,15 @@ pub fn compare(folders: &[PlanFolder]) -> CompareTable {
 /// The first method against each other one, wherever both had the same problems.
 fn duels(folders: &[PlanFolder], methods: &[String]) -> Vec<Duel> {
     let Some((first, others)) = methods.split_first() else { return Vec::new() };
-    let of = |method: &str| folders.iter().filter(move |folder| folder.method() == *method).collect::<Vec<_>>();
+    let of =
+        |method: &str| folders.iter().filter(move |folder| folder.method() == *method).collect::<Vec<_>>();
     let mut pairs: BTreeMap<(String, String), Vec<(bool, bool)>> = BTreeMap::new();
     for second in others {
         for (a, b) in of(first).into_iter().zip(of(second)) {
             for (set, outcomes) in &a.outcomes {
-                let Some(theirs) = b.outcomes.get(set).filter(|_| a.column(set) == b.column(set)) else { continue };
+                let Some(theirs) = b.outcomes.get(set).filter(|_| a.column(set) == b.column(set)) else {
+                    continue;
+                };
                 let shared = outcomes.iter().filter_map(|(id, ours)| Some((*ours, *theirs.get(id)?)));
                 pairs.entry((a.column(set), second.clone())).or_default().extend(shared);
             }
@@ -215,7 +219,11 @@ fn duels(folders: &[PlanFolder], methods: &[String]) -> Vec<Duel> {
 impl CompareTable {
     /// Returns the table as Markdown, percent.
     pub fn to_markdown(&self) -> String {
-        let mut text = format!("| percent | {} |\n|---|{}\n", self.columns.join(" | "), "---|".repeat(self.columns.len()));
+        let mut text = format!(
+            "| percent | {} |\n|---|{}\n",
+            self.columns.join(" | "),
+            "---|".repeat(self.columns.len())
+        );
         for row in &self.rows {
             let cell = |column: &String| {
                 let found = self.cells.iter().find(|cell| cell.column == *column && cell.row == *row);
@@ -251,7 +259,12 @@ impl Cell {
             0 | 1 => String::new(),
             many => format!(", {many} runs"),
         };
-        format!("{:.1} [{:.1}, {:.1}] (n {n}{seeds})", 100.0 * mean, 100.0 * interval.low, 100.0 * interval.high)
+        format!(
+            "{:.1} [{:.1}, {:.1}] (n {n}{seeds})",
+            100.0 * mean,
+            100.0 * interval.low,
+            100.0 * interval.high
+        )
     }
 }
 

@@ -156,9 +156,9 @@ pub fn read(path: Option<&Path>, overrides: &[String]) -> Result<EvalConfig, Con
         apply(&mut table, text)?;
     }
     let place = path.map_or_else(|| "[eval]".to_owned(), |path| format!("{} [eval]", path.display()));
-    let config: EvalConfig = toml::Value::Table(table)
-        .try_into()
-        .map_err(|error: toml::de::Error| ConfigError::Syntax { place, message: error.message().to_owned() })?;
+    let config: EvalConfig = toml::Value::Table(table).try_into().map_err(|error: toml::de::Error| {
+        ConfigError::Syntax { place, message: error.message().to_owned() }
+    })?;
     for (field, got, high, expected) in [
         ("plan.count", config.plan.count, 100_000, "1 to 100000"),
         ("plan.offset", config.plan.offset, 10_000, "1 to 10000"),
@@ -192,9 +192,11 @@ fn section(path: &Path) -> Result<toml::Table, ConfigError> {
 
 /// Puts `a.b=value` into a table; a value that is no TOML is a text.
 fn apply(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
-    let refuse = |message: &str| ConfigError::Syntax { place: format!("--set {text}"), message: message.to_owned() };
+    let refuse =
+        |message: &str| ConfigError::Syntax { place: format!("--set {text}"), message: message.to_owned() };
     let (path, value) = text.split_once('=').ok_or_else(|| refuse("expected key=value"))?;
-    let parsed = format!("value = {value}").parse::<toml::Table>().ok().and_then(|mut one| one.remove("value"));
+    let parsed =
+        format!("value = {value}").parse::<toml::Table>().ok().and_then(|mut one| one.remove("value"));
     let value = parsed.unwrap_or_else(|| toml::Value::String(value.to_owned()));
     let mut keys: Vec<&str> = path.split('.').collect();
     let last = keys.pop().filter(|key| !key.is_empty()).ok_or_else(|| refuse("expected key=value"))?;
@@ -219,7 +221,8 @@ mod tests {
     #[test]
     fn overrides_reach_every_depth() {
         let config =
-            overridden(&["plan.planner.samples=64", "plan.problems=final", "plan.planner.method=\"icem\""]).unwrap();
+            overridden(&["plan.planner.samples=64", "plan.problems=final", "plan.planner.method=\"icem\""])
+                .unwrap();
         let planner = config.plan.planner();
         assert_eq!((planner.samples, planner.iterations), (64, 30));
         assert_eq!(planner.method, crate::planner::Method::Icem);

@@ -184,10 +184,8 @@ impl Data {
             row,
             got: got.to_owned(),
         };
-        let bytes = self.dataset.read_frames(episode.run_index, camera, rows).map_err(|got| DataError::Rows {
-            path: self.dataset.root.clone(),
-            expected: "readable frames".to_owned(),
-            got,
+        let bytes = self.dataset.read_frames(episode.run_index, camera, rows).map_err(|got| {
+            DataError::Rows { path: self.dataset.root.clone(), expected: "readable frames".to_owned(), got }
         })?;
         if let Some(row) = rows.get(bytes.len()) {
             return Err(missing(*row, "fewer rows"));
@@ -219,10 +217,15 @@ fn decode_rgb(bytes: &[u8]) -> Result<Frame, ImageError> {
 }
 
 /// Positions of the model's dims within a continuous column.
-fn positions(dataset: &Dataset, column: &'static str, wanted: &EncodedFeature) -> Result<Vec<usize>, DataError> {
+fn positions(
+    dataset: &Dataset,
+    column: &'static str,
+    wanted: &EncodedFeature,
+) -> Result<Vec<usize>, DataError> {
     let declared = dataset.info.feature(column);
-    let names: Vec<String> =
-        declared.map(|feature| (0..feature.width()).map(|dim| feature.dim_name(dim)).collect()).unwrap_or_default();
+    let names: Vec<String> = declared
+        .map(|feature| (0..feature.width()).map(|dim| feature.dim_name(dim)).collect())
+        .unwrap_or_default();
     let position = |name: &str| {
         let found = names.iter().position(|have| have == name || (names.len() == 1 && have.is_empty()));
         found.ok_or_else(|| DataError::Dim { path: dataset.root.clone(), column, name: name.to_owned() })

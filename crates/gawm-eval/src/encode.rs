@@ -39,7 +39,10 @@ pub fn encode_frames(
         let mut bytes = Vec::with_capacity(FRAMES_PER_BLOCK * n_bytes);
         for frame in block {
             if frame.len() != n_bytes {
-                candle_core::bail!("frame: expected {n_bytes} bytes ({height}x{width}x3), got {}", frame.len());
+                candle_core::bail!(
+                    "frame: expected {n_bytes} bytes ({height}x{width}x3), got {}",
+                    frame.len()
+                );
             }
             bytes.extend_from_slice(frame);
         }
@@ -50,7 +53,8 @@ pub fn encode_frames(
         z.truncate(block.len() * model.architecture().config().latent_width);
         Ok(z)
     };
-    let blocks: Vec<candle_core::Result<Vec<f32>>> = frames.par_chunks(FRAMES_PER_BLOCK).map(encode).collect();
+    let blocks: Vec<candle_core::Result<Vec<f32>>> =
+        frames.par_chunks(FRAMES_PER_BLOCK).map(encode).collect();
     Ok(blocks.into_iter().collect::<candle_core::Result<Vec<_>>>()?.concat())
 }
 

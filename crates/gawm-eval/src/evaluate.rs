@@ -156,7 +156,8 @@ pub fn evaluate(
     rules: Rules,
     progress: &dyn Fn(usize),
 ) -> Vec<Outcome> {
-    let mut runs: Vec<Run<'_>> = problems.par_iter().map(|problem| Run::begin(world, problem, agent)).collect();
+    let mut runs: Vec<Run<'_>> =
+        problems.par_iter().map(|problem| Run::begin(world, problem, agent)).collect();
     for step in 0..rules.budget_steps {
         decide(&mut runs, agent, step);
         runs.par_iter_mut().for_each(|run| run.step(agent, rules, step));

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use crate::agent::Dynamics;
 use crate::encode::{device, encode_frames, fit_frame};
 use crate::evaluate::View;
-use crate::planner::{ActionSpace, EvaluateError, Evaluator, ObjectiveWeights};
+use crate::planner::{ActionSpace, EvaluateError, Evaluator, ObjectiveWeights, Slopes};
 use crate::world::World;
 
 /// Candidates that go through the predictor at once on a CPU, rounded to whole multiples of the samples of a problem.
@@ -129,7 +129,7 @@ impl Evaluator for LatentEvaluator<'_> {
         tasks: &[usize],
         candidates: &[f32],
         horizon: usize,
-    ) -> Result<Option<(Vec<f32>, Vec<f32>)>, EvaluateError> {
+    ) -> Result<Option<Slopes>, EvaluateError> {
         let width = self.width();
         let n_rows = candidates.len() / (horizon * width);
         let n = n_rows / tasks.len().max(1);
@@ -144,7 +144,7 @@ impl Evaluator for LatentEvaluator<'_> {
         let costs = self.costs_of(&predicted, &self.goals.index_select(&index, 0)?)?;
         let mut gradients = costs.sum_all()?.backward()?;
         let gradient = gradients.remove(&variable).map_or_else(|| variable.zeros_like(), Ok)?;
-        Ok(Some((costs.to_vec1()?, gradient.flatten_all()?.to_vec1()?)))
+        Ok(Some(Slopes { costs: costs.to_vec1()?, gradients: gradient.flatten_all()?.to_vec1()? }))
     }
 }
 
@@ -209,11 +209,10 @@ pub fn goal_frame(world: &dyn World, problem: &crate::problem::Problem) -> Resul
         return Ok(frame.as_ref().clone());
     }
     let mut environment = world.environment();
-    let state =
-        gawm_sim::State { system: problem.goal_system.clone(), goal: problem.state.goal.clone() };
-    environment
-        .set_state(&state)
-        .map_err(|error| EvaluateError::Candle(candle_core::Error::Msg(format!("goal of {}: {error}", problem.id))))?;
+    let state = gawm_sim::State { system: problem.goal_system.clone(), goal: problem.state.goal.clone() };
+    environment.set_state(&state).map_err(|error| {
+        EvaluateError::Candle(candle_core::Error::Msg(format!("goal of {}: {error}", problem.id)))
+    })?;
     let mut frame = Frame::default();
     environment.render(&mut frame);
     Ok(frame)

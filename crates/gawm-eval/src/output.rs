@@ -103,7 +103,11 @@ impl Table {
     /// Returns the table as comma-separated values with a header; texts with commas or quotes are quoted.
     pub fn to_csv(&self) -> String {
         let quote = |text: &str| {
-            if text.contains([',', '"', '\n']) { format!("\"{}\"", text.replace('"', "\"\"")) } else { text.to_owned() }
+            if text.contains([',', '"', '\n']) {
+                format!("\"{}\"", text.replace('"', "\"\""))
+            } else {
+                text.to_owned()
+            }
         };
         let names: Vec<String> = self.columns.iter().map(|(name, _)| quote(name)).collect();
         let mut csv = names.join(",") + "\n";

@@ -37,7 +37,14 @@ pub struct ProbeOptions {
 
 impl Default for ProbeOptions {
     fn default() -> Self {
-        ProbeOptions { train_share: 0.7, ridge: 1e-4, hidden: 128, epochs: 30, learning_rate: 2e-3, max_rows: 20_000 }
+        ProbeOptions {
+            train_share: 0.7,
+            ridge: 1e-4,
+            hidden: 128,
+            epochs: 30,
+            learning_rate: 2e-3,
+            max_rows: 20_000,
+        }
     }
 }
 
@@ -97,7 +104,8 @@ pub fn probe(
 ) -> candle_core::Result<ProbeReport> {
     let n = trajectories.len();
     let mut order = permutation(&mut Stream::new(seed, "probe/split", 0), n as u32);
-    let n_train = ((n as f64 * options.train_share).round() as usize).clamp(n.min(1), n.saturating_sub(1).max(1));
+    let n_train =
+        ((n as f64 * options.train_share).round() as usize).clamp(n.min(1), n.saturating_sub(1).max(1));
     let test: Vec<usize> = order.split_off(n_train.min(n)).into_iter().map(|i| i as usize).collect();
     let train: Vec<usize> = order.into_iter().map(|i| i as usize).collect();
     let ids = |of: &[usize]| of.iter().map(|&index| trajectories[index].id.clone()).collect();
@@ -114,11 +122,15 @@ pub fn probe(
     scale.apply(&mut fitted.x);
     let mut scored: Vec<(usize, Rows)> = vec![(0, collect(trajectories, &test))];
     let horizon = predictions.iter().map(|prediction| prediction.chunks).max().unwrap_or(0);
-    scored.extend((1..=horizon).map(|chunks| (chunks, collect_predictions(trajectories, predictions, &test, chunks))));
+    scored.extend(
+        (1..=horizon).map(|chunks| (chunks, collect_predictions(trajectories, predictions, &test, chunks))),
+    );
     scored.iter_mut().for_each(|(_, rows)| scale.apply(&mut rows.x));
 
-    let linear: Vec<Ridge> =
-        (0..s).into_par_iter().map(|dim| Ridge::fit(&fitted.x, &column(&fitted.y, s, dim), d, options.ridge)).collect();
+    let linear: Vec<Ridge> = (0..s)
+        .into_par_iter()
+        .map(|dim| Ridge::fit(&fitted.x, &column(&fitted.y, s, dim), d, options.ridge))
+        .collect();
     let mlp = Mlp::fit(&fitted.x, &fitted.y, d, s, options, seed)?;
     for (chunks, rows) in &scored {
         let read = mlp.predict(&rows.x)?;

@@ -163,7 +163,8 @@ impl Filter {
         let is_straight_solved = solves(environment, problem, budget_steps, |environment| {
             world.straight_line(&environment.state()).ok_or(ProblemError::NoWallSet)
         })?;
-        Ok(!is_straight_solved && solves(environment, problem, budget_steps, |environment| Ok(environment.oracle()))?)
+        Ok(!is_straight_solved
+            && solves(environment, problem, budget_steps, |environment| Ok(environment.oracle()))?)
     }
 }
 
@@ -276,7 +277,9 @@ pub fn draw_from_episodes(
     let pairs: Vec<(usize, usize)> = episodes
         .iter()
         .enumerate()
-        .flat_map(|(index, episode)| (0..episode.rows.len().saturating_sub(spec.offset)).map(move |row| (index, row)))
+        .flat_map(|(index, episode)| {
+            (0..episode.rows.len().saturating_sub(spec.offset)).map(move |row| (index, row))
+        })
         .collect();
     let mut stream = Stream::new(spec.seed, &format!("problems/{}/{}", spec.name, spec.filter.name()), 0);
     let order = permutation(&mut stream, u32::try_from(pairs.len()).unwrap_or(u32::MAX));

@@ -54,7 +54,9 @@ pub enum ProgramError {
     #[error("plan.source is dataset, and no dataset was given")]
     NoData,
     /// The dataset's states are not the environment's.
-    #[error("feature {feature:?} is no state of {task}: expected {expected} dims, got {got} (episode {episode})")]
+    #[error(
+        "feature {feature:?} is no state of {task}: expected {expected} dims, got {got} (episode {episode})"
+    )]
     System {
         /// The feature.
         feature: String,
@@ -91,7 +93,9 @@ pub fn problem_sets(
         let episodes = match data {
             Some(data) => episode_states(world, data, config, |_| true)?,
             None => (0..SIMULATED_EPISODES)
-                .map(|index| expert_episode(world, config.seed.wrapping_add(index), format!("simulated-{index}")))
+                .map(|index| {
+                    expert_episode(world, config.seed.wrapping_add(index), format!("simulated-{index}"))
+                })
                 .collect(),
         };
         let mut set = reference_problems(world, &episodes, config.count, config.seed)?;
@@ -240,7 +244,7 @@ pub fn write_plan(folder: &Path, result: &PlanResult, sheet_rows: usize) -> Resu
             let png = contact_sheet(&world, &named.set.problems, &shown.outcomes, sheet_rows)
                 .map_err(|cause| OutputError::Image { path: path.clone(), cause })?;
             write(&path, &png)?;
-            sheets.push((set.name.clone(), png));
+            sheets.push((set.name.clone(), shown.solver, png));
         }
     }
     success_table(report).write(folder, "success")?;
@@ -259,7 +263,8 @@ fn success_table(report: &PlanReport) -> Table {
         .iter()
         .flat_map(|set| set.solvers.iter().map(move |solver| (set.name.as_str(), solver)))
         .collect();
-    let number = |value: fn(&crate::suite::SolverResult) -> f64| rows.iter().map(move |(_, s)| Some(value(s)));
+    let number =
+        |value: fn(&crate::suite::SolverResult) -> f64| rows.iter().map(move |(_, s)| Some(value(s)));
     Table::default()
         .text("set", rows.iter().map(|(set, _)| (*set).to_owned()))
         .text("solver", rows.iter().map(|(_, solver)| solver.solver.name().to_owned()))
@@ -284,7 +289,8 @@ pub fn write_diagnosis(folder: &Path, diagnosis: &Diagnosis) -> Result<Page, Out
         .number("straightening", each().map(|(_, geometry)| geometry.straightness.score))
         .number("r95", each().map(|(_, geometry)| Some(geometry.r95 as f64)))
         .write(folder, "trajectories")?;
-    let local = || each().flat_map(|(t, g)| g.straightness.local.iter().enumerate().map(move |(row, s)| (t, row, s)));
+    let local =
+        || each().flat_map(|(t, g)| g.straightness.local.iter().enumerate().map(move |(row, s)| (t, row, s)));
     Table::default()
         .text("trajectory", local().map(|(trajectory, _, _)| trajectory.id.clone()))
         .number("step", local().map(|(_, row, _)| Some(row as f64)))

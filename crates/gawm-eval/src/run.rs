@@ -63,7 +63,9 @@ pub enum RunError {
         message: String,
     },
     /// There is no checkpoint yet.
-    #[error("no checkpoint in {path:?}: expected checkpoints/best.safetensors or checkpoints/last.safetensors")]
+    #[error(
+        "no checkpoint in {path:?}: expected checkpoints/best.safetensors or checkpoints/last.safetensors"
+    )]
     NoCheckpoint {
         /// The run folder.
         path: PathBuf,

@@ -219,7 +219,10 @@ mod tests {
         check(spearman(&x, &[1.0, 8.0, 27.0, 64.0]).unwrap(), 1.0, 1e-12);
         check(spearman(&[1.0, 1.0, 2.0], &[1.0, 1.0, 0.0]).unwrap(), -1.0, 1e-12);
         assert_eq!(pearson(&x, &[1.0; 4]), None);
-        assert_eq!((median(&[3.0, 1.0, 2.0]), median(&[1.0, 2.0]), median(&[])), (Some(2.0), Some(1.5), None));
+        assert_eq!(
+            (median(&[3.0, 1.0, 2.0]), median(&[1.0, 2.0]), median(&[])),
+            (Some(2.0), Some(1.5), None)
+        );
         let (mean, std) = mean_std(&[1.0, 3.0]).unwrap();
         check(mean, 2.0, 1e-12);
         check(std, 2f64.sqrt(), 1e-12);

@@ -6,7 +6,9 @@ use thiserror::Error;
 use crate::agent::{KnownDynamics, NoOp, Oracle, PlanningAgent, Random, StraightLine};
 use crate::evaluate::{Agent, Outcome, Rules, evaluate};
 use crate::latent::LatentDynamics;
-use crate::planner::{ActionSpace, Compat, Method, ObjectiveWeights, PlannerConfig, PlannerConfigError, planner};
+use crate::planner::{
+    ActionSpace, Compat, Method, ObjectiveWeights, PlannerConfig, PlannerConfigError, planner,
+};
 use crate::problem::{DrawSpec, Filter, Problem, ProblemSet};
 use crate::run::{Run, RunError};
 use crate::statistics::{Interval, PairedDifference, paired_difference, wilson};
@@ -226,7 +228,12 @@ impl ModelFacts {
             checkpoint: run.checkpoint.clone(),
             parameters: run.model.parameters().count(),
             schema_hash: run.hello.schema_hash.to_string(),
-            dataset_hashes: run.hello.datasets.iter().map(|dataset| dataset.content_hash.to_string()).collect(),
+            dataset_hashes: run
+                .hello
+                .datasets
+                .iter()
+                .map(|dataset| dataset.content_hash.to_string())
+                .collect(),
         }
     }
 }
@@ -288,6 +295,9 @@ pub fn run_suite(
         .collect()
 }
 
+/// Who acts, and how.
+type Contestant<'a> = (Solver, Box<dyn Agent + 'a>);
+
 /// All solvers on one set.
 struct Contest<'a> {
     world: &'a dyn World,
@@ -319,14 +329,16 @@ impl<'a> Contest<'a> {
         let environment = self.world.environment();
         match self.models {
             Some(models) => space_of(models.run, environment.spec()),
-            None => ActionSpace::new(environment.spec(), environment.spec().action.iter().map(|_| (0.0, 1.0)), 5),
+            None => {
+                ActionSpace::new(environment.spec(), environment.spec().action.iter().map(|_| (0.0, 1.0)), 5)
+            }
         }
     }
 
-    fn agents(&self) -> Result<Vec<(Solver, Box<dyn Agent + 'a>)>, SuiteError> {
+    fn agents(&self) -> Result<Vec<Contestant<'a>>, SuiteError> {
         let environment = self.world.environment();
         let spec = environment.spec();
-        let mut agents: Vec<(Solver, Box<dyn Agent + 'a>)> = Vec::new();
+        let mut agents: Vec<Contestant<'a>> = Vec::new();
         if let Some(models) = self.models {
             let shuffled = models.shuffled.map(|run| (Solver::ShuffledActions, run));
             let untrained = self.untrained.map(|run| (Solver::Untrained, run));
@@ -372,7 +384,8 @@ pub fn latent_agent<'a>(
         return Err(SuiteError::ActionWidth { task: spec.name, expected, got });
     }
     let architecture = run.model.architecture();
-    if config.objective.state > 0.0 && !(architecture.config().state_head && architecture.widths().state > 0) {
+    if config.objective.state > 0.0 && !(architecture.config().state_head && architecture.widths().state > 0)
+    {
         return Err(SuiteError::NoStateHead);
     }
     let space = space_of(run, spec);
@@ -415,7 +428,8 @@ fn finish(named: &NamedSet, solvers: Vec<SolverResult>) -> SetResult {
     let model = solvers.iter().find(|result| result.solver == Solver::Model);
     let comparisons = model.into_iter().flat_map(|model| {
         solvers.iter().filter(|other| other.solver != Solver::Model).map(|other| {
-            let pairs = model.outcomes.iter().zip(&other.outcomes).map(|(a, b)| (a.success_any, b.success_any));
+            let pairs =
+                model.outcomes.iter().zip(&other.outcomes).map(|(a, b)| (a.success_any, b.success_any));
             Comparison { against: other.solver, difference: paired_difference(pairs) }
         })
     });
@@ -435,7 +449,13 @@ fn finish(named: &NamedSet, solvers: Vec<SolverResult>) -> SetResult {
 }
 
 /// The sets of the honest protocol: non-trivial problems, and the wall set where there is one.
-pub fn honest_specs(name: &str, count: usize, offset: usize, budget_steps: usize, seed: u64) -> Vec<DrawSpec> {
+pub fn honest_specs(
+    name: &str,
+    count: usize,
+    offset: usize,
+    budget_steps: usize,
+    seed: u64,
+) -> Vec<DrawSpec> {
     let spec = |filter| DrawSpec { name: name.to_owned(), count, offset, filter, budget_steps, seed };
     vec![spec(Filter::NonTrivial), spec(Filter::Wall)]
 }

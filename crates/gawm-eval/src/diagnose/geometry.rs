@@ -58,7 +58,8 @@ pub fn geometry(trajectories: &[Trajectory], stride: usize) -> (GeometryReport, 
             TrajectoryGeometry { straightness, energies, r95 }
         })
         .collect();
-    let spread = |values: Vec<f64>| mean_std(&values).map(|(mean, std)| Spread { mean, std, n: values.len() });
+    let spread =
+        |values: Vec<f64>| mean_std(&values).map(|(mean, std)| Spread { mean, std, n: values.len() });
     let moving: Vec<&TrajectoryGeometry> = each.iter().filter(|one| one.r95 > 0).collect();
     let directions = moving.iter().map(|one| one.energies.len()).max().unwrap_or(0);
     let mut mean_cumulative_energy = vec![0.0; directions];
@@ -83,7 +84,11 @@ pub fn geometry(trajectories: &[Trajectory], stride: usize) -> (GeometryReport, 
     let report = GeometryReport {
         stride,
         straightening: spread(each.iter().filter_map(|one| one.straightness.score).collect()),
-        skipped_pairs: each.iter().flat_map(|one| &one.straightness.local).filter(|local| local.is_none()).count(),
+        skipped_pairs: each
+            .iter()
+            .flat_map(|one| &one.straightness.local)
+            .filter(|local| local.is_none())
+            .count(),
         r95: spread(moving.iter().map(|one| one.r95 as f64).collect()),
         mean_cumulative_energy,
         mean_displacement: mean_std(&displacements).map(|(mean, _)| mean),

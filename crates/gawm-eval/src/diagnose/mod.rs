@@ -177,7 +177,8 @@ impl DiagnoseOptions {
 /// # Errors
 /// - [`DiagnoseError::Schema`].
 pub fn check_schema(run: &Run, data: &Data) -> Result<(), DiagnoseError> {
-    let known: Vec<String> = run.hello.datasets.iter().map(|dataset| dataset.schema_hash.to_string()).collect();
+    let known: Vec<String> =
+        run.hello.datasets.iter().map(|dataset| dataset.schema_hash.to_string()).collect();
     match data.schema_hash() {
         Some(got) if !known.contains(&got) => {
             Err(DiagnoseError::Schema { expected: known.join(" or "), got })

@@ -26,7 +26,11 @@ pub fn rank(trajectories: &[Trajectory]) -> RankReport {
     let mut sum = vec![0.0; d];
     let mut n = 0usize;
     for trajectory in trajectories {
-        let z = DMatrix::from_row_iterator(trajectory.n_rows, d, trajectory.z.iter().map(|value| f64::from(*value)));
+        let z = DMatrix::from_row_iterator(
+            trajectory.n_rows,
+            d,
+            trajectory.z.iter().map(|value| f64::from(*value)),
+        );
         gram += z.transpose() * &z;
         for row in z.row_iter() {
             sum.iter_mut().zip(row.iter()).for_each(|(sum, value)| *sum += value);
@@ -75,9 +79,15 @@ mod tests {
         let mut stream = Stream::new(1, "rank", 0);
         let full = trajectory(stream.normals(20_000 * 4), 4);
         let report = rank(&[full]);
-        assert!((report.effective_rank - 4.0).abs() < 0.01 && (report.rankme - 4.0).abs() < 0.01, "{report:?}");
+        assert!(
+            (report.effective_rank - 4.0).abs() < 0.01 && (report.rankme - 4.0).abs() < 0.01,
+            "{report:?}"
+        );
         let line: Vec<f32> = stream.normals(1000).into_iter().flat_map(|x| [x, 2.0 * x, 0.0, -x]).collect();
         let report = rank(&[trajectory(line, 4)]);
-        assert!((report.effective_rank - 1.0).abs() < 1e-9 && (report.rankme - 1.0).abs() < 1e-5, "{report:?}");
+        assert!(
+            (report.effective_rank - 1.0).abs() < 1e-9 && (report.rankme - 1.0).abs() < 1e-5,
+            "{report:?}"
+        );
     }
 }

@@ -31,10 +31,16 @@ pub struct RetrievalReport {
 
 /// Asks for goals `offset` rows into the trajectories; `None` without states or with fewer than two trajectories.
 pub fn retrieval(trajectories: &[Trajectory], offset: usize, seed: u64) -> Option<RetrievalReport> {
-    let has_state = |t: &Trajectory, row: usize| t.state_width > 0 && t.state(row).iter().all(|v| v.is_finite());
+    let has_state =
+        |t: &Trajectory, row: usize| t.state_width > 0 && t.state(row).iter().all(|v| v.is_finite());
     let rows = |first: usize| -> Vec<(usize, usize)> {
         let of = |(index, t): (usize, &Trajectory)| (first..t.n_rows).map(move |row| (index, row));
-        trajectories.iter().enumerate().flat_map(of).filter(|&(index, row)| has_state(&trajectories[index], row)).collect()
+        trajectories
+            .iter()
+            .enumerate()
+            .flat_map(of)
+            .filter(|&(index, row)| has_state(&trajectories[index], row))
+            .collect()
     };
     let goals = sample(rows(offset), MAX_GOALS, &mut Stream::new(seed, "retrieval/goals", 0));
     let frames = sample(rows(0), MAX_FRAMES, &mut Stream::new(seed, "retrieval/frames", 0));
@@ -60,7 +66,9 @@ fn answer(trajectories: &[Trajectory], goal: (usize, usize), frames: &[(usize, u
         let squares = |(a, b): (&f32, &f32)| f64::from(a - b).powi(2);
         let frame = &trajectories[other];
         latent.push(own.latent(row).iter().zip(frame.latent(at)).map(squares).sum::<f64>());
-        state.push(own.state(row).iter().zip(frame.state(at)).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt());
+        state.push(
+            own.state(row).iter().zip(frame.state(at)).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt(),
+        );
     }
     let nearest = (0..latent.len()).min_by(|&a, &b| latent[a].total_cmp(&latent[b]))?;
     let best = state.iter().copied().fold(f64::INFINITY, f64::min);

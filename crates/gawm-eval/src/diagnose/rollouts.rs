@@ -25,10 +25,10 @@ pub struct HorizonReport {
     pub identity: f64,
     /// The same prediction with the action sequences of other starts.
     pub shuffled: f64,
-    /// `prediction / identity`: below 1 the model knows more than that nothing moves.
-    pub against_identity: f64,
-    /// `shuffled / prediction`: 1 means that actions are ignored.
-    pub action_sensitivity: f64,
+    /// `prediction / identity`: below 1 the model knows more than that nothing moves. `None` if nothing moves.
+    pub against_identity: Option<f64>,
+    /// `shuffled / prediction`: 1 means that actions are ignored. `None` if the prediction is perfect.
+    pub action_sensitivity: Option<f64>,
 }
 
 /// Prediction errors over all starts.
@@ -166,8 +166,8 @@ impl Rollouts<'_> {
             prediction,
             identity,
             shuffled,
-            against_identity: prediction / identity,
-            action_sensitivity: shuffled / prediction,
+            against_identity: (identity > 0.0).then(|| prediction / identity),
+            action_sensitivity: (prediction > 0.0).then(|| shuffled / prediction),
         }
     }
 }

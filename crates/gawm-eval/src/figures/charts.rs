@@ -52,7 +52,9 @@ pub fn lines(
         let places: Vec<(f64, f64)> = line.points.iter().map(|(x, y)| frame.at(*x, *y)).collect();
         canvas.path(&places, color);
         if series.len() > 1 {
-            canvas.add(&format!("<rect x=\"{legend:.1}\" y=\"280\" width=\"12\" height=\"4\" fill=\"{color}\"/>"));
+            canvas.add(&format!(
+                "<rect x=\"{legend:.1}\" y=\"280\" width=\"12\" height=\"4\" fill=\"{color}\"/>"
+            ));
             canvas.text(legend + 16.0, 286.0, "start", "small", &line.name);
             legend += 30.0 + 6.2 * line.name.chars().count() as f64;
         }
@@ -66,7 +68,8 @@ pub fn bars(title: &str, label: &str, bars: &[Bar], most: f64) -> String {
     let mut canvas = Canvas::new(520.0, 72.0 + row * bars.len() as f64, title);
     let low = bars.iter().map(|bar| bar.value).fold(0.0, f64::min);
     let height = row * bars.len() as f64;
-    let frame = Frame { left: 150.0, top: 30.0, width: 300.0, height, x: (low.max(-most), most), y: (0.0, 1.0) };
+    let frame =
+        Frame { left: 150.0, top: 30.0, width: 300.0, height, x: (low.max(-most), most), y: (0.0, 1.0) };
     for tick in super::svg::ticks(frame.x) {
         let (x, _) = frame.at(tick, 0.0);
         canvas.line((x, 30.0), (x, 30.0 + height), "grid");
@@ -96,16 +99,28 @@ pub fn bars(title: &str, label: &str, bars: &[Bar], most: f64) -> String {
     canvas.finish()
 }
 
+/// A trajectory to draw.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Picture {
+    /// Its name.
+    pub name: String,
+    /// Two components per row, [T, 2] row-major.
+    pub points: Vec<f64>,
+    /// Local straightening; a gap where there is none.
+    pub local: Vec<Option<f64>>,
+}
+
 /// Draws trajectories side by side: two components coloured by time, and local straightening below with its mean dashed.
 ///
-/// A picture is its name, its points [T, 2] row-major, and its local scores. Start is a circle, end a cross.
-pub fn pictures(title: &str, pictures: &[(String, Vec<f64>, Vec<Option<f64>>)]) -> String {
+/// Start is a circle, end a cross.
+pub fn pictures(title: &str, pictures: &[Picture]) -> String {
     let cell = 220.0;
     let mut canvas = Canvas::new(20.0 + cell * pictures.len().max(1) as f64, 330.0, title);
-    for (index, (name, points, local)) in pictures.iter().enumerate() {
+    for (index, Picture { name, points, local }) in pictures.iter().enumerate() {
         let left = 40.0 + cell * index as f64;
         let column = |offset: usize| points.iter().copied().skip(offset).step_by(2);
-        let frame = Frame { left, top: 46.0, width: 170.0, height: 150.0, x: range(column(0)), y: range(column(1)) };
+        let frame =
+            Frame { left, top: 46.0, width: 170.0, height: 150.0, x: range(column(0)), y: range(column(1)) };
         canvas.text(left + 85.0, 38.0, "middle", "small", name);
         scatter(&mut canvas, &frame, points);
         let below = Frame {
@@ -151,8 +166,13 @@ fn scatter(canvas: &mut Canvas, frame: &Frame, points: &[f64]) {
 
 /// Returns a colour from violet (0) over green to yellow (1), even to the eye.
 fn time_color(share: f64) -> String {
-    const ANCHORS: [[f64; 3]; 5] =
-        [[68.0, 1.0, 84.0], [59.0, 82.0, 139.0], [33.0, 145.0, 140.0], [94.0, 201.0, 98.0], [253.0, 231.0, 37.0]];
+    const ANCHORS: [[f64; 3]; 5] = [
+        [68.0, 1.0, 84.0],
+        [59.0, 82.0, 139.0],
+        [33.0, 145.0, 140.0],
+        [94.0, 201.0, 98.0],
+        [253.0, 231.0, 37.0],
+    ];
     let place = share.clamp(0.0, 1.0) * 4.0;
     let index = (place as usize).min(3);
     let blend = place - index as f64;
@@ -172,7 +192,10 @@ mod tests {
         assert!(svg.contains("t &amp; u") && svg.contains("a&lt;b") && !svg.contains("NaN"), "{svg}");
         let bar = Bar { label: "model".to_owned(), value: 0.5, interval: Some((0.4, 0.6)), kind: 0 };
         assert!(bars("rates", "success", &[bar], 1.0).contains("model"));
-        assert!(!pictures("empty", &[("e".to_owned(), Vec::new(), vec![None])]).contains("NaN"));
+        assert!(
+            !pictures("empty", &[Picture { name: "e".to_owned(), points: Vec::new(), local: vec![None] }])
+                .contains("NaN")
+        );
         assert!(!lines("none", ("x", "y"), &[], &[], None).contains("NaN"));
     }
 }

@@ -5,6 +5,6 @@ mod page;
 mod reports;
 mod svg;
 
-pub use charts::{Bar, Line, bars, lines, pictures};
+pub use charts::{Bar, Line, Picture, bars, lines, pictures};
 pub use page::{Page, escape};
 pub use reports::{compare_page, diagnose_figures, diagnose_page, plan_figures, plan_page};

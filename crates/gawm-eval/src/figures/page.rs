@@ -55,7 +55,9 @@ impl Page {
     /// Adds a picture.
     pub fn png(&mut self, bytes: &[u8], caption: &str) {
         let (data, caption) = (STANDARD.encode(bytes), escape(caption));
-        self.body += &format!("<figure><img alt=\"{caption}\" src=\"data:image/png;base64,{data}\"><figcaption>{caption}</figcaption></figure>\n");
+        self.body += &format!(
+            "<figure><img alt=\"{caption}\" src=\"data:image/png;base64,{data}\"><figcaption>{caption}</figcaption></figure>\n"
+        );
     }
 
     /// Returns the file.

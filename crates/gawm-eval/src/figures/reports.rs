@@ -2,7 +2,7 @@
 
 use gawm_model::diagnostics::principal_components;
 
-use super::{Bar, Line, Page, bars, lines, pictures};
+use super::{Bar, Line, Page, Picture, bars, lines, pictures};
 use crate::compare::CompareTable;
 use crate::diagnose::{DiagnoseReport, Diagnosis};
 use crate::suite::{PlanReport, Rate, SetResult, Solver};
@@ -30,8 +30,8 @@ pub fn plan_figures(report: &PlanReport) -> Vec<(String, String)> {
     report.sets.iter().map(figure).collect()
 }
 
-/// Makes the page of a protocol; `sheets` are (set, PNG).
-pub fn plan_page(report: &PlanReport, sheets: &[(String, Vec<u8>)]) -> Page {
+/// Makes the page of a protocol; `sheets` are (set, who acted, PNG).
+pub fn plan_page(report: &PlanReport, sheets: &[(String, Solver, Vec<u8>)]) -> Page {
     let name = report.model.as_ref().map_or_else(|| "floors".to_owned(), |model| model.method.clone());
     let mut page = Page::new(&format!("Planning: {name} on {} ({} protocol)", report.task, report.protocol));
     let planner = &report.options.planner;
@@ -51,8 +51,8 @@ pub fn plan_page(report: &PlanReport, sheets: &[(String, Vec<u8>)]) -> Page {
         if !set.comparisons.is_empty() {
             page.table(&comparison_table(set));
         }
-        for (_, png) in sheets.iter().filter(|(name, _)| *name == set.name) {
-            page.png(png, "model: start, six moments, goal; green solved, red not");
+        for (_, solver, png) in sheets.iter().filter(|(name, _, _)| *name == set.name) {
+            page.png(png, &format!("{}: start, six moments, goal; green solved, red not", solver.name()));
         }
     }
     page
@@ -82,7 +82,8 @@ fn set_table(set: &SetResult) -> Vec<Vec<String>> {
 }
 
 fn comparison_table(set: &SetResult) -> Vec<Vec<String>> {
-    let head = ["model minus", "difference", "95 % (Newcombe, paired)", "only model / only other", "p (McNemar)"];
+    let head =
+        ["model minus", "difference", "95 % (Newcombe, paired)", "only model / only other", "p (McNemar)"];
     let row = |comparison: &crate::suite::Comparison| {
         let difference = &comparison.difference;
         vec![
@@ -125,14 +126,25 @@ pub fn compare_page(table: &CompareTable) -> Page {
 pub fn diagnose_figures(diagnosis: &Diagnosis) -> Vec<(String, String)> {
     let report = &diagnosis.report;
     let mut figures = vec![("pca".to_owned(), pca_figure(diagnosis))];
-    let energy: Vec<(f64, f64)> =
-        report.geometry.mean_cumulative_energy.iter().enumerate().map(|(k, e)| ((k + 1) as f64, *e)).collect();
+    let energy: Vec<(f64, f64)> = report
+        .geometry
+        .mean_cumulative_energy
+        .iter()
+        .enumerate()
+        .map(|(k, e)| ((k + 1) as f64, *e))
+        .collect();
     let shown = energy.iter().take_while(|(_, e)| *e < 0.9999).count().max(3).min(energy.len());
     let energy = vec![Line { name: "energy".to_owned(), points: energy[..shown].to_vec() }];
     let title = "Mean cumulative energy of transitions";
-    figures.push(("energy".to_owned(), lines(title, ("directions", "share"), &energy, &[0.95], Some((0.0, 1.02)))));
+    figures.push((
+        "energy".to_owned(),
+        lines(title, ("directions", "share"), &energy, &[0.95], Some((0.0, 1.02))),
+    ));
     let scores = diagnosis.geometries.iter().filter_map(|one| one.straightness.score);
-    figures.push(("straightening".to_owned(), histogram("Straightening per trajectory", "mean local score", scores)));
+    figures.push((
+        "straightening".to_owned(),
+        histogram("Straightening per trajectory", "mean local score", scores),
+    ));
     if !report.rollouts.horizons.is_empty() {
         let series = |name: &str, value: fn(&crate::diagnose::HorizonReport) -> f64| Line {
             name: name.to_owned(),
@@ -144,7 +156,10 @@ pub fn diagnose_figures(diagnosis: &Diagnosis) -> Vec<(String, String)> {
             series("shuffled actions", |h| h.shuffled),
         ];
         let title = "Open-loop error of latents";
-        figures.push(("prediction".to_owned(), lines(title, ("chunks ahead", "mean squared error"), &all, &[], None)));
+        figures.push((
+            "prediction".to_owned(),
+            lines(title, ("chunks ahead", "mean squared error"), &all, &[], None),
+        ));
     }
     if !report.probe.scores.is_empty() {
         let bar = |score: &crate::probe::ProbeScore| Bar {
@@ -153,20 +168,28 @@ pub fn diagnose_figures(diagnosis: &Diagnosis) -> Vec<(String, String)> {
             interval: None,
             kind: usize::from(score.probe == "linear"),
         };
-        let encoded: Vec<Bar> = report.probe.scores.iter().filter(|score| score.chunks == 0).map(bar).collect();
-        figures.push(("probes".to_owned(), bars("Probes on encoded latents", "R2 on other episodes", &encoded, 1.0)));
+        let encoded: Vec<Bar> =
+            report.probe.scores.iter().filter(|score| score.chunks == 0).map(bar).collect();
+        figures.push((
+            "probes".to_owned(),
+            bars("Probes on encoded latents", "R2 on other episodes", &encoded, 1.0),
+        ));
     }
     figures
 }
 
 fn pca_figure(diagnosis: &Diagnosis) -> String {
-    let picture = |(trajectory, geometry): (&crate::diagnose::Trajectory, &crate::diagnose::TrajectoryGeometry)| {
-        let z = trajectory.strided(diagnosis.report.options.stride);
-        let points = principal_components(&z, trajectory.latent_width, 2);
-        (trajectory.id.clone(), points, geometry.straightness.local.clone())
-    };
+    let picture =
+        |(trajectory, geometry): (&crate::diagnose::Trajectory, &crate::diagnose::TrajectoryGeometry)| {
+            let z = trajectory.strided(diagnosis.report.options.stride);
+            let points = principal_components(&z, trajectory.latent_width, 2);
+            Picture { name: trajectory.id.clone(), points, local: geometry.straightness.local.clone() }
+        };
     let all = diagnosis.trajectories.iter().zip(&diagnosis.geometries).take(PICTURES);
-    pictures("Latents: two principal components by time, local straightening below", &all.map(picture).collect::<Vec<_>>())
+    pictures(
+        "Latents: two principal components by time, local straightening below",
+        &all.map(picture).collect::<Vec<_>>(),
+    )
 }
 
 fn histogram(title: &str, label: &str, values: impl Iterator<Item = f64>) -> String {
@@ -190,7 +213,9 @@ pub fn diagnose_page(diagnosis: &Diagnosis) -> Page {
     let origin = if report.is_held_out { "held-out episodes" } else { "episodes (none is held out)" };
     page.note(&format!(
         "{} fixed trajectories of {origin}, {} latents, stride {}; their ids are in diagnose.json.",
-        report.trajectory_ids.len(), report.frames, report.geometry.stride
+        report.trajectory_ids.len(),
+        report.frames,
+        report.geometry.stride
     ));
     page.table(&numbers(report));
     let figures = diagnose_figures(diagnosis);
@@ -207,6 +232,10 @@ pub fn diagnose_page(diagnosis: &Diagnosis) -> Page {
     page
 }
 
+fn optional(value: Option<f64>) -> String {
+    value.map(|value| format!("{value:.3}")).unwrap_or_default()
+}
+
 fn numbers(report: &DiagnoseReport) -> Vec<Vec<String>> {
     let mut rows = vec![vec!["measure".to_owned(), "value".to_owned()]];
     let mut add = |name: &str, value: String| rows.push(vec![name.to_owned(), value]);
@@ -220,8 +249,8 @@ fn numbers(report: &DiagnoseReport) -> Vec<Vec<String>> {
     add("RankMe", format!("{:.1}", report.rank.rankme));
     add("mean std of latents", format!("{:.4}", report.rank.mean_std));
     if let Some(last) = report.rollouts.horizons.last() {
-        add(&format!("error after {} chunks / standing still", last.chunks), format!("{:.3}", last.against_identity));
-        add("error with shuffled actions / with true ones", format!("{:.2}", last.action_sensitivity));
+        add(&format!("error after {} chunks / standing still", last.chunks), optional(last.against_identity));
+        add("error with shuffled actions / with true ones", optional(last.action_sensitivity));
     }
     if let Some(retrieval) = report.retrieval {
         add("state distance of the frame nearest to a goal's latent", format!("{:.3}", retrieval.latent));
@@ -232,24 +261,33 @@ fn numbers(report: &DiagnoseReport) -> Vec<Vec<String>> {
 }
 
 fn rollout_table(report: &DiagnoseReport) -> Vec<Vec<String>> {
-    let head = ["chunks ahead", "prediction", "identity", "shuffled", "prediction / identity", "shuffled / prediction"];
+    let head = [
+        "chunks ahead",
+        "prediction",
+        "identity",
+        "shuffled",
+        "prediction / identity",
+        "shuffled / prediction",
+    ];
     let row = |h: &crate::diagnose::HorizonReport| {
-        let values = [h.prediction, h.identity, h.shuffled, h.against_identity, h.action_sensitivity];
-        std::iter::once(h.chunks.to_string()).chain(values.map(|value| format!("{value:.4}"))).collect()
+        let errors = [h.prediction, h.identity, h.shuffled].map(|value| format!("{value:.4}"));
+        let ratios = [h.against_identity, h.action_sensitivity].map(optional);
+        std::iter::once(h.chunks.to_string()).chain(errors).chain(ratios).collect()
     };
-    std::iter::once(head.map(str::to_owned).to_vec()).chain(report.rollouts.horizons.iter().map(row)).collect()
+    std::iter::once(head.map(str::to_owned).to_vec())
+        .chain(report.rollouts.horizons.iter().map(row))
+        .collect()
 }
 
 fn probe_table(report: &DiagnoseReport) -> Vec<Vec<String>> {
     let head = ["dim", "probe", "chunks ahead", "R2", "Pearson r", "RMSE", "unit", "n"];
-    let value = |value: Option<f64>| value.map(|v| format!("{v:.3}")).unwrap_or_default();
     let row = |s: &crate::probe::ProbeScore| {
         vec![
             s.dim.clone(),
             s.probe.clone(),
             s.chunks.to_string(),
-            value(s.r2),
-            value(s.pearson),
+            optional(s.r2),
+            optional(s.pearson),
             format!("{:.3}", s.rmse),
             s.unit.clone(),
             s.n.to_string(),

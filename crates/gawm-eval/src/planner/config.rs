@@ -163,7 +163,13 @@ impl PlannerConfig {
             ("horizon", self.horizon, 1, 1000, "1 to 1000"),
             ("receding", self.receding, 1, self.horizon, "1 to the horizon"),
             ("history", self.history, 1, 1024, "1 to the history of the model"),
-            ("kept_elites", self.kept_elites, 0, self.elites.min(self.samples - 1), "0 to the number of elites"),
+            (
+                "kept_elites",
+                self.kept_elites,
+                0,
+                self.elites.min(self.samples - 1),
+                "0 to the number of elites",
+            ),
         ];
         for (field, got, low, high, expected) in counts {
             if got < low || got > high {
@@ -171,7 +177,11 @@ impl PlannerConfig {
             }
         }
         if self.compat == Compat::Reference && self.method != Method::Cem {
-            return refuse("method", "cem with compat = \"reference\"", format!("{:?}", self.method).to_lowercase());
+            return refuse(
+                "method",
+                "cem with compat = \"reference\"",
+                format!("{:?}", self.method).to_lowercase(),
+            );
         }
         let numbers = [
             ("sigma", positive(self.sigma), "a positive number", self.sigma),

@@ -1,7 +1,8 @@
 //! Gradient descent on the actions, through differentiable dynamics.
 
 use super::{
-    ActionSpace, Deadline, Evaluator, NoiseSource, Plan, PlanSource, Planner, PlannerConfig, PlannerError, Task,
+    ActionSpace, Deadline, Evaluator, NoiseSource, Plan, PlanSource, Planner, PlannerConfig, PlannerError,
+    Slopes, Task,
 };
 
 const BETA1: f32 = 0.9;
@@ -56,8 +57,10 @@ impl<N: NoiseSource> GradientPlanner<N> {
                 x.iter_mut().zip(bounds.iter().cycle()).for_each(clamp);
             }
             let found = evaluator.gradients(&[index], &x, self.config.horizon)?;
-            let (costs, gradients) = found.ok_or(PlannerError::NoGradient)?;
-            let cheapest = (0..costs.len()).filter(|&i| costs[i].is_finite()).min_by(|&a, &b| costs[a].total_cmp(&costs[b]));
+            let Slopes { costs, gradients } = found.ok_or(PlannerError::NoGradient)?;
+            let cheapest = (0..costs.len())
+                .filter(|&i| costs[i].is_finite())
+                .min_by(|&a, &b| costs[a].total_cmp(&costs[b]));
             let Some(cheapest) = cheapest else {
                 return Err(PlannerError::NonFinite { expected: 1, iteration, finite: 0 });
             };
@@ -69,11 +72,14 @@ impl<N: NoiseSource> GradientPlanner<N> {
             for ((x, g), (m, v)) in x.iter_mut().zip(&gradients).zip(first.iter_mut().zip(&mut second)) {
                 *m = BETA1 * *m + (1.0 - BETA1) * g;
                 *v = BETA2 * *v + (1.0 - BETA2) * g * g;
-                *x -= self.config.learning_rate * (*m / corrections[0]) / ((*v / corrections[1]).sqrt() + EPSILON);
+                *x -= self.config.learning_rate * (*m / corrections[0])
+                    / ((*v / corrections[1]).sqrt() + EPSILON);
             }
         }
         Ok(match best {
-            Some((cost, chunks)) => Plan { chunks, cost: Some(cost), lowest_costs, source: PlanSource::Sample },
+            Some((cost, chunks)) => {
+                Plan { chunks, cost: Some(cost), lowest_costs, source: PlanSource::Sample }
+            }
             None => Plan { chunks: start, cost: None, lowest_costs, source: PlanSource::Fallback },
         })
     }

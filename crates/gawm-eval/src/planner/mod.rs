@@ -40,7 +40,7 @@ pub trait Evaluator: Sync {
     /// The dynamics cannot be computed at all.
     fn costs(&self, tasks: &[usize], candidates: &[f32], horizon: usize) -> Result<Vec<f32>, EvaluateError>;
 
-    /// Returns costs [`tasks`, N] and their gradients [`tasks`, N, L, A], or `None` where dynamics have no gradient.
+    /// Returns costs and their gradients, or `None` where dynamics have no gradient.
     ///
     /// # Errors
     /// As for [`costs`](Self::costs).
@@ -49,9 +49,18 @@ pub trait Evaluator: Sync {
         _tasks: &[usize],
         _candidates: &[f32],
         _horizon: usize,
-    ) -> Result<Option<(Vec<f32>, Vec<f32>)>, EvaluateError> {
+    ) -> Result<Option<Slopes>, EvaluateError> {
         Ok(None)
     }
+}
+
+/// Costs of candidates and which way they fall.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Slopes {
+    /// Costs [tasks, N].
+    pub costs: Vec<f32>,
+    /// Gradients of each cost by its own candidate, [tasks, N, L, A].
+    pub gradients: Vec<f32>,
 }
 
 /// Why costs cannot be computed.
@@ -163,10 +172,7 @@ pub trait Planner: Send + Sync {
 ///
 /// # Errors
 /// [`PlannerConfigError`] names a setting that cannot be searched with.
-pub fn planner(
-    config: &PlannerConfig,
-    space: &ActionSpace,
-) -> Result<Box<dyn Planner>, PlannerConfigError> {
+pub fn planner(config: &PlannerConfig, space: &ActionSpace) -> Result<Box<dyn Planner>, PlannerConfigError> {
     config.check()?;
     let noise = SeededNoise { seed: config.seed };
     Ok(match (config.compat, config.method) {
@@ -181,7 +187,8 @@ pub fn planner(
 /// Mean squared difference of consecutive actions of a sequence [L, A] of chunks of `frameskip` actions.
 fn roughness(sequence: &[f32], action_width: usize) -> f32 {
     let later = sequence.iter().skip(action_width);
-    let (sum, n) = sequence.iter().zip(later).fold((0.0, 0), |(sum, n), (a, b)| (sum + (b - a) * (b - a), n + 1));
+    let (sum, n) =
+        sequence.iter().zip(later).fold((0.0, 0), |(sum, n), (a, b)| (sum + (b - a) * (b - a), n + 1));
     if n == 0 { 0.0 } else { sum / n as f32 }
 }
 

@@ -97,7 +97,8 @@ mod tests {
                 let variance = values.iter().map(|x| f64::from(x * x)).sum::<f64>() / n;
                 assert!((variance - 1.0).abs() < 0.05, "steps {steps}, beta {beta}: variance {variance}");
                 let rows: Vec<&[f32]> = values.chunks_exact(2).collect();
-                let pairs = rows.chunks_exact(steps).flat_map(|s| s.windows(2)).map(|w| f64::from(w[0][0] * w[1][0]));
+                let pairs =
+                    rows.chunks_exact(steps).flat_map(|s| s.windows(2)).map(|w| f64::from(w[0][0] * w[1][0]));
                 let neighbours = pairs.sum::<f64>() / (4000 * (steps - 1)) as f64;
                 assert!((low..high).contains(&neighbours), "steps {steps}, beta {beta}: {neighbours}");
             }

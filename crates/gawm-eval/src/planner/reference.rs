@@ -41,7 +41,9 @@ impl<N: NoiseSource> ReferenceCem<N> {
         };
         let mut noise = TaskNoise { source: &self.noise, task };
         let plan = cem(&config, index, width, start.as_ref(), &mut noise, &Device::Cpu, cost)?;
-        let lowest = |costs: &[f32]| costs.iter().copied().filter(|cost| cost.is_finite()).fold(f32::INFINITY, f32::min);
+        let lowest = |costs: &[f32]| {
+            costs.iter().copied().filter(|cost| cost.is_finite()).fold(f32::INFINITY, f32::min)
+        };
         Ok(Plan {
             chunks: plan.mean.flatten_all().and_then(|mean| mean.to_vec1()).map_err(candle)?,
             cost: None,

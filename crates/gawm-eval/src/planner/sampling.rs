@@ -139,7 +139,8 @@ impl<N: NoiseSource> SamplingPlanner<N> {
         let weights: Vec<f64> = order.iter().map(|&index| weight(index)).collect();
         let total: f64 = weights.iter().sum();
         let column = |column: usize| {
-            let terms = order.iter().zip(&weights).map(|(&index, weight)| weight * f64::from(sample(index)[column]));
+            let terms =
+                order.iter().zip(&weights).map(|(&index, weight)| weight * f64::from(sample(index)[column]));
             (terms.sum::<f64>() / total) as f32
         };
         (0..self.length()).map(column).collect()
@@ -154,10 +155,16 @@ impl<N: NoiseSource> SamplingPlanner<N> {
         iteration: usize,
     ) -> Result<(), PlannerError> {
         let live: Vec<usize> = live(searches);
+        if live.is_empty() {
+            return Ok(());
+        }
         let candidates: Vec<f32> = live
             .par_iter()
             .flat_map_iter(|&index| {
-                searches[index].as_ref().map(|search| self.draw(&tasks[index], search, iteration)).unwrap_or_default()
+                searches[index]
+                    .as_ref()
+                    .map(|search| self.draw(&tasks[index], search, iteration))
+                    .unwrap_or_default()
             })
             .collect();
         let costs = evaluator.costs(&live, &candidates, self.config.horizon)?;
@@ -169,7 +176,9 @@ impl<N: NoiseSource> SamplingPlanner<N> {
             .zip(candidates.chunks_exact(per_problem).zip(costs.chunks_exact(n)))
             .map(|(search, (candidates, costs))| (search, candidates, costs))
             .collect();
-        updates.par_iter_mut().for_each(|(search, candidates, costs)| self.update(search, candidates, costs, iteration));
+        updates
+            .par_iter_mut()
+            .for_each(|(search, candidates, costs)| self.update(search, candidates, costs, iteration));
         Ok(())
     }
 
@@ -180,6 +189,9 @@ impl<N: NoiseSource> SamplingPlanner<N> {
         searches: &mut [Result<Search, PlannerError>],
     ) -> Result<Vec<bool>, PlannerError> {
         let live = live(searches);
+        if live.is_empty() {
+            return Ok(vec![false; searches.len()]);
+        }
         let mut means = Vec::with_capacity(live.len() * self.length());
         for search in searches.iter().flatten().filter(|search| search.error.is_none()) {
             let bounds = self.space.standardised_bounds();
@@ -201,7 +213,8 @@ impl<N: NoiseSource> SamplingPlanner<N> {
 
 /// Positions of the searches that still run.
 fn live(searches: &[Result<Search, PlannerError>]) -> Vec<usize> {
-    let is_live = |search: &Result<Search, PlannerError>| search.as_ref().is_ok_and(|search| search.error.is_none());
+    let is_live =
+        |search: &Result<Search, PlannerError>| search.as_ref().is_ok_and(|search| search.error.is_none());
     (0..searches.len()).filter(|&index| is_live(&searches[index])).collect()
 }
 
@@ -237,7 +250,8 @@ impl<N: NoiseSource> Planner for SamplingPlanner<N> {
         tasks: &[Task],
         is_late: Deadline<'_>,
     ) -> Vec<Result<Plan, PlannerError>> {
-        let mut searches: Vec<Result<Search, PlannerError>> = tasks.iter().map(|task| self.begin(task)).collect();
+        let mut searches: Vec<Result<Search, PlannerError>> =
+            tasks.iter().map(|task| self.begin(task)).collect();
         let mut is_mean = vec![false; tasks.len()];
         let mut was_late = false;
         let outcome = (0..self.config.iterations).try_for_each(|iteration| {

@@ -17,7 +17,14 @@ pub(super) struct Mlp {
 
 impl Mlp {
     /// Fits `y` [N, s] on `x` [N, d]; values without a target (NaN) have no weight.
-    pub(super) fn fit(x: &[f32], y: &[f64], d: usize, s: usize, options: &ProbeOptions, seed: u64) -> Result<Mlp> {
+    pub(super) fn fit(
+        x: &[f32],
+        y: &[f64],
+        d: usize,
+        s: usize,
+        options: &ProbeOptions,
+        seed: u64,
+    ) -> Result<Mlp> {
         let device = Device::Cpu;
         let hidden = options.hidden.max(1);
         let init = |name: &str, rows: usize, columns: usize, fan_in: usize| {
@@ -86,7 +93,12 @@ impl Adam {
         Ok(Adam { first: zeros()?, second: zeros()?, step: 0 })
     }
 
-    fn update(&mut self, parameters: &[Var], gradients: &candle_core::backprop::GradStore, rate: f64) -> Result<()> {
+    fn update(
+        &mut self,
+        parameters: &[Var],
+        gradients: &candle_core::backprop::GradStore,
+        rate: f64,
+    ) -> Result<()> {
         self.step += 1;
         let corrections = [0.9f64, 0.999].map(|beta| 1.0 - beta.powf(self.step as f64));
         for (index, parameter) in parameters.iter().enumerate() {
