@@ -2,7 +2,7 @@
 //!
 //! candle's own `layer_norm`, `softmax_last_dim` and `Tensor::gelu` are fast and wrong for us: the first two have no
 //! backward pass and end the gradient without an error, the third is the tanh approximation. A test compares every
-//! function here with finite differences.
+//! function here with finite differences. Linear layers go through `gawm-kernels` where it takes them.
 
 use candle_core::{D, DType, Device, Tensor, Var};
 use gawm_kernels::GradientSink;
