@@ -94,13 +94,9 @@ fn appending_one_by_one_is_the_same_as_all_at_once() {
     assert_eq!(status, ["already_there", "already_there", "ok"]);
 }
 
-#[test]
-fn a_killed_run_resumes_to_the_same_bytes() {
-    let folder = tempfile::tempdir().unwrap();
-    let logs = variants(folder.path(), 6);
-    let (whole, resumed) = (folder.path().join("whole"), folder.path().join("resumed"));
-    run(&demo_contract(), &whole, &refs(&logs), &[], 0);
-    let mut args = vec!["run", "--config", "pipelines/demo.toml", "--out", text(&resumed)];
+/// Starts a run, kills it as soon as `is_time` says so, resumes it, and expects the bytes of an undisturbed one.
+fn check_killed(logs: &[PathBuf], whole: &Path, resumed: &Path, is_time: impl Fn() -> bool) {
+    let mut args = vec!["run", "--config", "pipelines/demo.toml", "--out", text(resumed)];
     args.extend(logs.iter().map(|log| text(log)));
     let mut child = Command::new(program())
         .args(&args)
@@ -109,14 +105,98 @@ fn a_killed_run_resumes_to_the_same_bytes() {
         .stderr(Stdio::null())
         .spawn()
         .unwrap();
-    // As soon as something lies on the disk, or the run is over: both must resume.
-    while child.try_wait().unwrap().is_none() && !resumed.join("data").exists() {
+    // The run may be over before the kill comes: that must resume, too.
+    while child.try_wait().unwrap().is_none() && !is_time() {
         std::thread::yield_now();
     }
     child.kill().ok();
     child.wait().unwrap();
-    run(&demo_contract(), &resumed, &refs(&logs), &["--resume"], 0);
-    check_same(&whole, &resumed);
+    run(&demo_contract(), resumed, &refs(logs), &["--resume"], 0);
+    check_same(whole, resumed);
+}
+
+#[test]
+fn a_killed_run_resumes_to_the_same_bytes() {
+    let folder = tempfile::tempdir().unwrap();
+    let logs = variants(folder.path(), 6);
+    let whole = folder.path().join("whole");
+    run(&demo_contract(), &whole, &refs(&logs), &[], 0);
+    // At the first, the third and the last data file, and when the meta files are written.
+    for (n, wanted) in [
+        "data/chunk-000/file-000.parquet.tmp",
+        "data/chunk-000/file-002.parquet.tmp",
+        "data/chunk-000/file-005.parquet.tmp",
+        "meta/tasks.parquet",
+        "gawm/encoded",
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let resumed = folder.path().join(format!("resumed-{n}"));
+        check_killed(&logs, &whole, &resumed, || resumed.join(wanted).exists());
+    }
+}
+
+/// Asks a running program to stop.
+#[cfg(unix)]
+fn interrupt(child: &std::process::Child) {
+    let status = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(status.success());
+}
+
+#[cfg(unix)]
+#[test]
+fn an_interrupted_run_says_so_and_resumes() {
+    let folder = tempfile::tempdir().unwrap();
+    let logs = variants(folder.path(), 10);
+    let (whole, out) = (folder.path().join("whole"), folder.path().join("out"));
+    run(&demo_contract(), &whole, &refs(&logs), &[], 0);
+    let mut args = vec!["run", "--config", "pipelines/demo.toml", "--out", text(&out)];
+    args.extend(logs.iter().map(|log| text(log)));
+    let child = Command::new(program())
+        .args(&args)
+        .current_dir(support::root())
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    while !out.join("data/chunk-000/file-001.parquet.tmp").exists() {
+        std::thread::yield_now();
+    }
+    interrupt(&child);
+    let output = child.wait_with_output().unwrap();
+    let said = stderr(&output);
+    // Whoever is asked to stop when nothing is left to do has finished.
+    if code(&output) != 0 {
+        assert_eq!(code(&output), 130, "{said}");
+        assert!(said.contains("--resume"), "{said}");
+        assert!(!out.join("meta/info.json").exists());
+    }
+    run(&demo_contract(), &out, &refs(&logs), &["--resume"], 0);
+    check_same(&whole, &out);
+}
+
+/// A limit on the size of files stands for a full disk.
+#[cfg(unix)]
+#[test]
+fn a_full_disk_is_an_error_and_resumes() {
+    let folder = tempfile::tempdir().unwrap();
+    let logs = variants(folder.path(), 2);
+    let (whole, out) = (folder.path().join("whole"), folder.path().join("out"));
+    run(&demo_contract(), &whole, &refs(&logs), &[], 0);
+    let limited = "trap '' XFSZ; ulimit -f 24; exec \"$0\" \"$@\"";
+    let output = Command::new("sh")
+        .args(["-c", limited, text(program()), "run", "--config", "pipelines/demo.toml", "--out", text(&out)])
+        .args(logs.iter().map(|log| text(log)))
+        .current_dir(support::root())
+        .output()
+        .unwrap();
+    let said = stderr(&output);
+    assert_eq!(code(&output), 1, "{said}");
+    assert!(said.contains("File too large") && said.contains("file-000.parquet"), "{said}");
+    assert!(said.contains("--resume") && !said.contains("panicked"), "{said}");
+    run(&demo_contract(), &out, &refs(&logs), &["--resume"], 0);
+    check_same(&whole, &out);
 }
 
 #[test]
@@ -331,6 +411,53 @@ fn explain_shows_the_messages_behind_a_number() {
         assert_eq!(code(&output), 2);
         assert!(stderr(&output).contains(words), "{}", stderr(&output));
     }
+}
+
+#[test]
+fn explain_goes_into_derived_actions() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    run(&demo_contract(), &out, &[&demo_log()], &[], 0);
+    let explain = |frame: &str| {
+        let output =
+            ingest(&["explain", text(&out), "0", frame, "action.position_x", "--log", text(&demo_log())]);
+        assert_eq!(code(&output), 0, "{}", stderr(&output));
+        stdout(&output)
+    };
+    let state = Dataset::open(&out).values("observation.state", "position_x");
+    let said = explain("5");
+    assert!(said.contains("derived from observation.state: next"), "{said}");
+    assert!(said.contains("\"position_x\" in frame 6"), "{said}");
+    assert!(said.contains(&format!("> {:?}  /odom in demo.mcap", state[6])), "{said}");
+    assert!(said.contains("encoding: gawm.action[0] \"position_x\" (identity of position_x)"), "{said}");
+    let said = explain("29");
+    assert!(said.contains("not valid") && said.contains("the one of frame 28 is repeated"), "{said}");
+    assert!(said.contains(&format!("> {:?}  /odom in demo.mcap", state[29])), "{said}");
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn results_that_cannot_be_written_are_an_error() {
+    let full = || std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    for args in [&["suggest", text(&demo_log())][..], &["inspect", text(&demo_log())]] {
+        let output = Command::new(program())
+            .args(args)
+            .stdout(full())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap()
+            .wait_with_output()
+            .unwrap();
+        assert_eq!(code(&output), 1, "{args:?}");
+        assert!(stderr(&output).contains("cannot write the result to stdout"), "{}", stderr(&output));
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    let args = ["run", "--config", "pipelines/demo.toml", "--report", "/no/such/folder/r.json", "--out"];
+    let output = ingest(&[&args[..], &[text(&out), text(&demo_log())]].concat());
+    assert_eq!(code(&output), 1);
+    assert!(stderr(&output).contains("/no/such/folder/r.json"), "{}", stderr(&output));
+    assert!(!out.exists(), "said before the work, not after it");
 }
 
 #[test]

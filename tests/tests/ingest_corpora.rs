@@ -101,6 +101,27 @@ fn the_arm_in_five_encodings_equals_its_truth() {
     }
 }
 
+/// A command array holds joint angles, one of which wraps, and something else behind them.
+#[test]
+fn commands_that_joint_angles_follow_are_angles() {
+    let Some(corpora) = shared() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let contract = folder.path().join("c.toml");
+    suggest(&[&corpora.join("generated/arm_ros2_zstd.mcap")], &contract);
+    let written: toml::Table = toml::from_str(&std::fs::read_to_string(&contract).unwrap()).unwrap();
+    let mut found = Vec::new();
+    for stream in written["stream"].as_array().unwrap() {
+        if stream["topic"].as_str() == Some("/arm/command") {
+            let fields: Vec<&str> =
+                stream["fields"].as_array().unwrap().iter().map(|field| field.as_str().unwrap()).collect();
+            let text = |key: &str| stream.get(key).and_then(toml::Value::as_str).unwrap_or("").to_owned();
+            found.push((fields.join(" "), text("kind"), text("wrap")));
+        }
+    }
+    let expected = [("data[0:5]", "angle", ""), ("data[5]", "angle", "pi"), ("data[6]", "", "")];
+    assert_eq!(found, expected.map(|(a, b, c)| (a.to_owned(), b.to_owned(), c.to_owned())));
+}
+
 #[test]
 fn jobs_do_not_change_the_bytes_of_the_arm() {
     let Some(corpora) = shared() else { return };

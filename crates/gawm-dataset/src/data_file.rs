@@ -87,7 +87,9 @@ impl DataFile {
             self.mark.n_groups += 1;
             self.group_bytes = 0;
         }
-        self.writer.flush()
+        self.writer.flush()?;
+        self.writer.inner_mut().sync_early()?;
+        Ok(())
     }
 
     /// Writes the footer, waits until all is on the disk and returns the length of the file.
@@ -95,7 +97,7 @@ impl DataFile {
         self.writer.finish()?;
         let length = self.writer.bytes_written() as u64;
         self.writer.sync()?;
-        self.writer.inner().sync()?;
+        self.writer.inner_mut().sync()?;
         Ok(length)
     }
 

@@ -5,9 +5,13 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::thread::JoinHandle;
 
 /// Suffix of files that are being written.
 pub(crate) const TEMPORARY: &str = ".tmp";
+
+/// Bytes that are brought to the disk at once, before the end.
+const EARLY_SYNC_BYTES: u64 = 16 << 20;
 
 /// Where files are created; tests limit the space.
 #[derive(Debug, Clone, Default)]
@@ -20,6 +24,10 @@ pub(crate) struct Disk {
 pub(crate) struct DiskFile {
     file: File,
     disk: Disk,
+    /// Bytes since the last early sync.
+    unsynced_bytes: u64,
+    /// Brings what was written so far to the disk, beside the work.
+    early_sync: Option<JoinHandle<io::Result<()>>>,
 }
 
 impl Disk {
@@ -31,7 +39,7 @@ impl Disk {
 
     /// Creates or empties a file.
     pub(crate) fn create(&self, path: &Path) -> io::Result<DiskFile> {
-        Ok(DiskFile { file: File::create(path)?, disk: self.clone() })
+        Ok(DiskFile { file: File::create(path)?, disk: self.clone(), unsynced_bytes: 0, early_sync: None })
     }
 
     /// Writes a whole file: temporary file, fsync, rename, fsync of the folder.
@@ -46,8 +54,37 @@ impl Disk {
 }
 
 impl DiskFile {
+    /// Begins to bring the bytes to the disk, so that less is left to wait for at the end. Does nothing while an
+    /// earlier call is still at it, or when little was written since.
+    ///
+    /// # Errors
+    /// - what an earlier call met: the system tells of a failed write once only.
+    pub(crate) fn sync_early(&mut self) -> io::Result<()> {
+        let is_running = self.early_sync.as_ref().is_some_and(|running| !running.is_finished());
+        if is_running || self.unsynced_bytes < EARLY_SYNC_BYTES {
+            return Ok(());
+        }
+        self.finish_early_sync()?;
+        self.unsynced_bytes = 0;
+        // Without another handle or thread all is left for the end.
+        if let Ok(file) = self.file.try_clone() {
+            let sync = move || file.sync_data();
+            self.early_sync = std::thread::Builder::new().name("sync".to_owned()).spawn(sync).ok();
+        }
+        Ok(())
+    }
+
+    fn finish_early_sync(&mut self) -> io::Result<()> {
+        match self.early_sync.take().map(JoinHandle::join) {
+            Some(Ok(result)) => result,
+            Some(Err(_)) => Err(io::Error::other("the thread that syncs the file has failed")),
+            None => Ok(()),
+        }
+    }
+
     /// Waits until the bytes are on the disk.
-    pub(crate) fn sync(&self) -> io::Result<()> {
+    pub(crate) fn sync(&mut self) -> io::Result<()> {
+        self.finish_early_sync()?;
         self.file.sync_all()
     }
 }
@@ -60,7 +97,9 @@ impl Write for DiskFile {
                 return Err(io::ErrorKind::StorageFull.into());
             }
         }
-        self.file.write(bytes)
+        let written = self.file.write(bytes)?;
+        self.unsynced_bytes += written as u64;
+        Ok(written)
     }
 
     fn flush(&mut self) -> io::Result<()> {

@@ -83,7 +83,7 @@ fn encode_file(
         writer.write(&rows).and_then(|()| writer.flush()).map_err(WriteError::parquet(target))?;
     }
     writer.finish().map_err(WriteError::parquet(target))?;
-    let sync = writer.sync().and_then(|()| writer.inner().sync());
+    let sync = writer.sync().and_then(|()| writer.inner_mut().sync());
     sync.map_err(WriteError::io("write", target))
 }
 

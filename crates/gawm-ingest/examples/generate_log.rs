@@ -36,6 +36,7 @@ struct Topic {
 struct Frame<'a> {
     stamp_ns: u64,
     index: u64,
+    is_right: bool,
     jpegs: &'a [Vec<u8>],
 }
 
@@ -115,7 +116,9 @@ fn imu(cdr: &mut Cdr, frame: &Frame<'_>) {
 fn camera(cdr: &mut Cdr, frame: &Frame<'_>) {
     cdr.header(frame.stamp_ns, "camera");
     cdr.text("jpeg");
-    cdr.bytes(&frame.jpegs[frame.index as usize % frame.jpegs.len()]);
+    // The cameras are half a cycle apart, so that no image occurs twice in a chunk.
+    let shift = if frame.is_right { frame.jpegs.len() / 2 } else { 0 };
+    cdr.bytes(&frame.jpegs[(frame.index as usize + shift) % frame.jpegs.len()]);
 }
 
 fn topics(kind: &str) -> Result<Vec<Topic>> {
@@ -154,10 +157,10 @@ fn topics(kind: &str) -> Result<Vec<Topic>> {
     })
 }
 
-/// Returns 16 textured 640x480 JPEG frames, about 60 kB each.
+/// Returns 64 textured 640x480 JPEG frames, about 60 kB each.
 fn jpegs() -> Result<Vec<Vec<u8>>> {
     let (width, height) = (640u32, 480u32);
-    (0..16u32)
+    (0..64u32)
         .map(|frame| {
             let mut pixels = Vec::with_capacity((width * height * 3) as usize);
             for y in 0..height {
@@ -200,7 +203,10 @@ fn main() -> Result<()> {
         let (which, &(stamp_ns, index)) =
             next.iter().enumerate().min_by_key(|(_, due)| due.0).expect("a topic");
         cdr.begin();
-        (topics[which].payload)(&mut cdr, &Frame { stamp_ns, index, jpegs: &jpegs });
+        (topics[which].payload)(
+            &mut cdr,
+            &Frame { stamp_ns, index, is_right: topics[which].name.ends_with("right"), jpegs: &jpegs },
+        );
         let header = MessageHeader {
             channel_id: channels[which],
             sequence: index as u32,

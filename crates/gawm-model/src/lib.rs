@@ -93,7 +93,7 @@ pub use encoder::{Encoder, Vit};
 pub use frames::{IMAGE_MEAN, IMAGE_STD, standardize_frames};
 pub use heads::{InverseDynamics, StateProbe};
 pub use model::WorldModel;
-pub use objective::{Clips, Control, Losses, Objectives, Term, losses};
+pub use objective::{Clips, Control, Losses, Objectives, Term, latent_losses, losses};
 pub use optimizer::{AdamW, AdamWConfig, Decay, Gradients, OptimizerError, StepReport};
 pub use parameters::{Init, ParameterError, ParameterSpec, Parameters, Specs};
 pub use pass::{Pass, Precision};

@@ -20,7 +20,9 @@ pub(super) fn environment(folder: &Path, requirements: &Path, bare: &[&str]) -> 
     run(Command::new("python3").args(["-m", "venv"]).arg(folder))?;
     let pip = |arguments: &mut Command| run(arguments).map(|_| ());
     pip(Command::new(&python).args(["-m", "pip", "install", "--quiet", "-r"]).arg(requirements))?;
-    pip(Command::new(&python).args(["-m", "pip", "install", "--quiet", "--no-deps"]).args(bare))?;
+    if !bare.is_empty() {
+        pip(Command::new(&python).args(["-m", "pip", "install", "--quiet", "--no-deps"]).args(bare))?;
+    }
     std::fs::write(&done, "").with_context(|| format!("cannot write {}", done.display()))?;
     Ok(python)
 }

@@ -20,6 +20,9 @@ const BLOCK_ROWS: usize = 1024;
 /// A block is closed before its frames would take more bytes than this.
 const BLOCK_BYTES: u64 = 4 << 20;
 
+/// Bytes of rows without images that are hashed at once.
+const HASHED_BYTES: usize = 1 << 16;
+
 /// An episode that has begun and not ended.
 pub(super) struct OpenEpisode {
     info: EpisodeInfo,
@@ -197,9 +200,8 @@ impl OpenEpisode {
 
     /// Hashes row by row, so that the hash does not depend on where blocks end.
     fn hash_block(&mut self, columns: &Columns) {
-        let mut bytes = Vec::new();
+        let mut bytes = Vec::with_capacity(2 * HASHED_BYTES);
         for row in 0..self.block.len() {
-            bytes.clear();
             bytes.extend(self.block.time_ns[row].to_le_bytes());
             for (plan, values) in columns.vectors.iter().zip(&self.block.vectors) {
                 values.row_bytes(row, plan.width(), &mut bytes);
@@ -208,11 +210,15 @@ impl OpenEpisode {
             for frames in &self.block.images {
                 bytes.extend((frames[row].len() as u64).to_le_bytes());
             }
-            self.hasher.update(&bytes);
+            if !self.block.images.is_empty() || bytes.len() >= HASHED_BYTES {
+                self.hasher.update(&bytes);
+                bytes.clear();
+            }
             for frames in &self.block.images {
                 self.hasher.update(&frames[row]);
             }
         }
+        self.hasher.update(&bytes);
     }
 
     fn check_continuity(&mut self, columns: &Columns, rows: &Rows) -> Result<(), WriteError> {

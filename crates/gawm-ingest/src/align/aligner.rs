@@ -105,6 +105,11 @@ impl<I: Clone> Aligner<I> {
         self.buffers[stream].total
     }
 
+    /// Returns the images that may still be needed.
+    pub fn images(&self) -> impl Iterator<Item = &I> {
+        self.buffers.iter().flat_map(Buffer::images)
+    }
+
     /// Opens an interval in which rows are made; returns its number.
     pub fn open_interval(&mut self, start_ns: i64) -> u64 {
         let id = self.next_interval;

@@ -43,6 +43,6 @@ pub(crate) fn run(args: &ExplainArgs, _global: &Global) -> Result<Exit, Failure>
         error: anyhow::Error::new(error),
         hint: None,
     })?;
-    print(&text);
+    print(&text)?;
     Ok(Exit::Clean)
 }

@@ -57,9 +57,9 @@ pub(crate) fn run(args: &InspectArgs, global: &Global) -> Result<Exit, Failure> 
             error: anyhow::Error::new(error),
             hint: None,
         })?;
-        print(&(text + "\n"));
+        print(&(text + "\n"))?;
     } else {
-        print(&render_text(&report));
+        print(&render_text(&report))?;
     }
     if report.files.is_empty()
         && let Some(refused) = report.refused.first()

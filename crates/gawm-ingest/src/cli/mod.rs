@@ -140,7 +140,15 @@ fn chain(error: &anyhow::Error) -> String {
     text
 }
 
-/// Writes a result to stdout; a reader that has gone away (`| head`) is no error.
-pub(crate) fn print(text: &str) {
-    std::io::stdout().lock().write_all(text.as_bytes()).ok();
+/// Writes a result to stdout; a reader that has gone away (`| head`) is no error, a full disk is.
+pub(crate) fn print(text: &str) -> Result<(), Failure> {
+    let mut stdout = std::io::stdout().lock();
+    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure {
+            code: 1,
+            error: anyhow::Error::new(error).context("cannot write the result to stdout"),
+            hint: None,
+        }),
+        _ => Ok(()),
+    }
 }

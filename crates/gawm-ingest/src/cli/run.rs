@@ -66,10 +66,17 @@ pub(crate) fn run(args: &RunArgs, global: &Global) -> Result<Exit, Failure> {
     let written = contract::load(&args.config, &args.set).map_err(from_contract)?;
     let checked = contract::check(&written, &args.config.display().to_string()).map_err(from_contract)?;
     if args.print_config {
-        print(&contract::to_toml(&written).map_err(from_contract)?);
+        print(&contract::to_toml(&written).map_err(from_contract)?)?;
         return Ok(Exit::Clean);
     }
     let Some(out) = args.out.as_deref() else { return Ok(Exit::Clean) };
+    if let Some(path) = &args.report {
+        // What cannot be written is said before the work, not after it.
+        let opened = std::fs::OpenOptions::new().create(true).append(true).open(path);
+        opened.map_err(|source| failure(RunError::Report { path: path.to_owned(), source }))?;
+    }
+    // The writer's threads are the global ones; whoever embeds this module may have set them up before.
+    rayon::ThreadPoolBuilder::new().num_threads(global.jobs()).build_global().ok();
     let interrupt = Arc::new(AtomicBool::new(false));
     let flag = Arc::clone(&interrupt);
     ctrlc::set_handler(move || flag.store(true, std::sync::atomic::Ordering::Relaxed)).map_err(|error| {
@@ -100,7 +107,7 @@ pub(crate) fn run(args: &RunArgs, global: &Global) -> Result<Exit, Failure> {
                 write_report(path, &outcome.report)?;
             }
             warn(&outcome.report, global);
-            print(&summary::text(&outcome, out));
+            print(&summary::text(&outcome, out))?;
             match (outcome.has_loss(), args.strict) {
                 (false, _) => Ok(Exit::Clean),
                 (true, false) => Ok(Exit::Loss),

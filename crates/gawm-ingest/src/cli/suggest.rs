@@ -28,7 +28,7 @@ pub(crate) fn run(args: &SuggestArgs, _global: &Global) -> Result<Exit, Failure>
     let mut suggestion = suggest::suggest(&args.logs, &library, &OpenOptions::default())
         .map_err(|error| Failure { code: 1, hint: error.hint(), error: anyhow::Error::new(error) })?;
     suggestion.contract.schemas.clone_from(&args.schemas);
-    print(&suggest::to_toml(&suggestion));
+    print(&suggest::to_toml(&suggestion))?;
     Ok(Exit::Clean)
 }
 

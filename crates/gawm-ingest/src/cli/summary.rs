@@ -44,17 +44,21 @@ fn write(text: &mut String, outcome: &RunOutcome, out: &Path) -> std::fmt::Resul
         };
         writeln!(text, "  {:<32} {what}", feature.name)?;
     }
-    writeln!(text, "\nstreams                            age ms: median      95 %       max   invalid rows")?;
+    let width = report.streams.iter().map(|stream| stream.stream.len()).max().unwrap_or(0).max(28);
+    writeln!(text, "\n{:<width$}   age ms: median      95 %       max   invalid rows", "streams")?;
     for stream in &report.streams {
         writeln!(
             text,
-            "  {:<32} {:>15} {:>9} {:>9}   {:>12}",
+            "  {:<width$} {:>15} {:>9} {:>9}   {:>12}",
             stream.stream,
             age(stream.age_ms_p50),
             age(stream.age_ms_p95),
             age(stream.age_ms_max),
             stream.invalid_rows
         )?;
+    }
+    if report.streams.iter().any(|stream| stream.age_ms_p50 < 0.0) {
+        writeln!(text, "  (an age below 0: the command comes after the row's tick, before the next)")?;
     }
     losses(text, outcome)?;
     writeln!(text, "\nnext\n  gawm-data validate {0}\n  gawm-data report {0}", out.display())

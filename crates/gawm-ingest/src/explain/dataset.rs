@@ -11,7 +11,7 @@ use gawm_schema::Feature;
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
-use super::{ExplainError, Question};
+use super::ExplainError;
 
 /// Where a value stands and what is known of it.
 pub(crate) struct RowOrigin {
@@ -33,6 +33,11 @@ pub(crate) struct RowOrigin {
 }
 
 impl RowOrigin {
+    /// Returns whether it is the last row of its episode.
+    pub(crate) fn is_last(&self) -> bool {
+        self.next_ns.is_none()
+    }
+
     pub(crate) fn files(&self) -> Vec<String> {
         self.recording
             .source
@@ -55,7 +60,7 @@ pub(crate) fn meta(dir: &Path) -> Result<GawmMeta, ExplainError> {
 pub(crate) fn origin(
     dir: &Path,
     meta: &GawmMeta,
-    question: &Question<'_>,
+    (wanted_episode, wanted_frame): (u64, u64),
     feature: &Feature,
     index: Option<usize>,
 ) -> Result<RowOrigin, ExplainError> {
@@ -64,10 +69,9 @@ pub(crate) fn origin(
         .recordings
         .iter()
         .find(|recording| {
-            (recording.first_episode..recording.first_episode + recording.episodes)
-                .contains(&question.episode)
+            (recording.first_episode..recording.first_episode + recording.episodes).contains(&wanted_episode)
         })
-        .ok_or(ExplainError::Episode { episode: question.episode, episodes })?;
+        .ok_or(ExplainError::Episode { episode: wanted_episode, episodes })?;
     let mut length = 0;
     let mut found: Option<RowOrigin> = None;
     for file in &recording.files {
@@ -83,10 +87,10 @@ pub(crate) fn origin(
                 return;
             };
             for at in 0..batch.num_rows() {
-                if u64::try_from(episode.value(at)) == Ok(question.episode) {
+                if u64::try_from(episode.value(at)) == Ok(wanted_episode) {
                     length += 1;
                     let number = u64::try_from(frame.value(at)).unwrap_or_default();
-                    if number == question.frame {
+                    if number == wanted_frame {
                         let file = data_path(file.number).display().to_string();
                         let (value, image_bytes) = value_of(batch, feature, index, at);
                         found = Some(RowOrigin {
@@ -101,7 +105,7 @@ pub(crate) fn origin(
                             age_ms: ages_of(batch, AGE_MS, at),
                             arrival_age_ms: ages_of(batch, ARRIVAL_AGE_MS, at),
                         });
-                    } else if number == question.frame + 1
+                    } else if number == wanted_frame + 1
                         && let Some(found) = &mut found
                     {
                         found.next_ns = Some(time.value(at));
@@ -111,7 +115,7 @@ pub(crate) fn origin(
             }
         })?;
     }
-    found.ok_or(ExplainError::Frame { episode: question.episode, frame: question.frame, length })
+    found.ok_or(ExplainError::Frame { episode: wanted_episode, frame: wanted_frame, length })
 }
 
 fn read(path: &Path, feature: &Feature, take: &mut dyn FnMut(&RecordBatch)) -> Result<(), ExplainError> {

@@ -10,7 +10,7 @@ use super::dataset::RowOrigin;
 use crate::align::{ActionTiming, Method};
 use crate::contract::{AlignSpec, CheckedContract, Clock, StreamData};
 use crate::decode::SchemaLibrary;
-use crate::log::{Log, OpenOptions, discover};
+use crate::log::discover;
 use crate::run::{Binding, BoundStream, OpenRecording, Plans, Source};
 
 /// Ages are stored in ms as 32-bit floats: a sample is recognised within this of where its age says.
@@ -38,6 +38,7 @@ pub(crate) struct Found {
 pub(crate) fn sources(
     recording: &RecordingRecord,
     inputs: &[PathBuf],
+    contract: &CheckedContract,
 ) -> Result<Option<OpenRecording>, ExplainError> {
     let mut logs = Vec::new();
     let found = discover(inputs);
@@ -50,10 +51,10 @@ pub(crate) fn sources(
                 continue;
             }
             let fail = |detail: String| ExplainError::Log { path: path.clone(), detail };
-            let log = Log::open(path, &OpenOptions::default()).map_err(|error| fail(error.to_string()))?;
+            let log = Source::open(path, contract).map_err(|error| fail(error.to_string()))?;
             let hash = log.content_hash().map_err(|error| fail(error.to_string()))?;
             if hash == file.content_hash.0 {
-                logs.push(Source::Log(Box::new(log)));
+                logs.push(log);
                 break;
             }
         }
@@ -117,13 +118,13 @@ pub(crate) fn around(
                     is_after: false,
                 });
             };
-            for (group, (range, stamp_ns)) in topic.groups.iter().zip(&message.rows) {
+            for (group, (range, stamp_ns)) in topic.groups.iter().zip(message.rows(&decoded.rows)) {
                 for (_, columns) in group.streams.iter().filter(|(at, _)| *at == stream && !range.is_empty())
                 {
                     take(*stamp_ns, decoded.values[range.clone()][columns.clone()].to_vec());
                 }
             }
-            if let Some((_, stamp_ns)) = message.picture.as_ref().filter(|_| topic.images.contains(&stream)) {
+            if let Some((_, stamp_ns)) = message.picture().filter(|_| topic.images.contains(&stream)) {
                 take(*stamp_ns, Vec::new());
             }
         }
@@ -180,11 +181,13 @@ fn neighbours(found: Vec<Found>) -> Vec<Found> {
 pub(crate) fn describe(
     text: &mut String,
     stream: &BoundStream,
-    column: Option<usize>,
+    columns: &[usize],
     found: &[Found],
 ) -> std::fmt::Result {
-    if let Some(path) = column.and_then(|column| stream.columns.get(column)) {
-        writeln!(text, "  field: {path}")?;
+    let paths: Vec<&str> =
+        columns.iter().filter_map(|column| stream.columns.get(*column)).map(String::as_str).collect();
+    if !paths.is_empty() {
+        writeln!(text, "  field: {}", paths.join(", "))?;
     }
     writeln!(text, "  messages (> marks those behind the value):")?;
     if found.is_empty() {
@@ -193,8 +196,12 @@ pub(crate) fn describe(
     let n_used = found.iter().filter(|message| message.is_used).count();
     for message in found.iter().take(LISTED.max(n_used.min(2 * LISTED))) {
         let mark = if message.is_used { '>' } else { ' ' };
-        let value = column.and_then(|column| message.values.get(column));
-        let value = value.map_or("image".to_owned(), |value| format!("{value:?}"));
+        let values: Vec<String> = columns
+            .iter()
+            .filter_map(|column| message.values.get(*column))
+            .map(|value| format!("{value:?}"))
+            .collect();
+        let value = if values.is_empty() { "image".to_owned() } else { values.join(", ") };
         let stamp = message.stamp_ns.map_or("none".to_owned(), |ns| ns.to_string());
         let when = if message.is_after { "after the tick" } else { "at or before the tick" };
         writeln!(

@@ -1,16 +1,20 @@
 //! Shows where one number of a dataset comes from: the raw messages, the rule and the encoding behind it.
 
 mod dataset;
+mod describe;
 mod messages;
 
 use std::fmt::Write as _;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use gawm_schema::{Feature, FeatureData, Kind};
+use gawm_schema::{Feature, FeatureData, Role};
 use thiserror::Error;
 
-use crate::contract::{CheckedContract, CheckedStream, Clock, ContractError, StreamData, check, parse};
-use crate::run::{BindError, Binding, BoundStream, RunError};
+use crate::align::Derivation;
+use crate::contract::{CheckedContract, ContractError, StreamData, TopicPattern, check, parse};
+use crate::decode::SchemaLibrary;
+use crate::run::{BindError, Binding, BoundStream, OpenRecording, RunError};
 use dataset::RowOrigin;
 
 /// Why a number cannot be explained.
@@ -122,46 +126,201 @@ impl Target<'_> {
 pub fn explain(question: &Question<'_>) -> Result<String, ExplainError> {
     let meta = dataset::meta(question.dir)?;
     let target = target(&meta.schema.features, question.dim)?;
-    let origin = dataset::origin(question.dir, &meta, question, target.feature, target.index)?;
+    let place = Place { dir: question.dir, meta: &meta, episode: question.episode };
+    let origin = place.origin(question.frame, &target)?;
     let mut text = String::new();
     // Writing to a text cannot fail.
-    row(&mut text, question, &target, &origin).ok();
+    head(&mut text, question, &target, &origin).ok();
     let contract_text = meta.contracts.iter().find(|contract| contract.hash == origin.recording.contract);
     let contract_text = contract_text.map(|contract| contract.text.as_str()).unwrap_or_default();
     let contract = check(&parse(contract_text, "meta/gawm.json", &[])?, "meta/gawm.json")?;
-    let found = messages::sources(&origin.recording, question.logs)?;
-    let Some(open) = found else {
+    let log = OpenSources::open(question, &contract, &origin)?;
+    if log.is_none() {
         writeln!(text, "  source: {}", origin.files().join(", ")).ok();
-        rules_without_log(&mut text, &contract, &target);
-        encoding(&mut text, &meta, &target);
-        text.push_str("\nthe raw messages are shown when the source files are given: --log FILE...\n");
-        return Ok(text);
-    };
-    let mut library = crate::decode::SchemaLibrary::builtin();
-    for folder in &contract.written.schemas {
-        // Types that are missing now only keep their channels from being shown.
-        library.add_folder(folder).ok();
     }
-    let binding =
-        Binding::new(&contract, &open.name, &open.channels, &library).map_err(|error| match error {
-            BindError::Run(error) => ExplainError::Run(error),
-            BindError::Refused(refusal) => {
-                ExplainError::Log { path: question.dir.to_owned(), detail: refusal.to_string() }
-            }
-        })?;
-    match stream_of(&binding, &target) {
-        Some((stream, columns)) => {
-            rule(&mut text, &binding.streams[stream].rule, &binding.streams[stream].topic).ok();
-            ages(&mut text, &origin, stream).ok();
-            let used = messages::around(&open, &binding, stream, &contract, &origin, &library);
-            messages::describe(&mut text, &binding.streams[stream], columns, &used).ok();
+    let explainer = Explainer { place, contract: &contract, log: log.as_ref() };
+    // The last action of an episode repeats the one before, which is where its number comes from.
+    let is_repeated = target.feature.role == Role::Action && origin.is_last() && !origin.is_valid;
+    match question.frame.checked_sub(1).filter(|_| is_repeated) {
+        Some(before) => {
+            writeln!(
+                text,
+                "  last row of its episode: no action follows, the one of frame {before} is repeated"
+            )
+            .ok();
+            let origin = place.origin(before, &target)?;
+            explainer.value(&mut text, &target, &origin, before)?;
         }
-        None => text.push_str(
-            "  rule: derived from the state of this row and the next; there is no message behind it\n",
-        ),
+        None => explainer.value(&mut text, &target, &origin, question.frame)?,
     }
     encoding(&mut text, &meta, &target);
+    if log.is_none() {
+        text.push_str("\nthe raw messages are shown when the source files are given: --log FILE...\n");
+    }
     Ok(text)
+}
+
+/// An episode of a dataset.
+#[derive(Clone, Copy)]
+struct Place<'a> {
+    dir: &'a Path,
+    meta: &'a gawm_dataset::GawmMeta,
+    episode: u64,
+}
+
+impl Place<'_> {
+    fn origin(&self, frame: u64, target: &Target<'_>) -> Result<RowOrigin, ExplainError> {
+        dataset::origin(self.dir, self.meta, (self.episode, frame), target.feature, target.index)
+    }
+}
+
+/// The logs of a recording, and what the contract takes from them.
+struct OpenSources {
+    open: OpenRecording,
+    binding: Binding,
+    library: SchemaLibrary,
+}
+
+impl OpenSources {
+    /// Opens the logs that a row comes from; none when they are not among the files given.
+    fn open(
+        question: &Question<'_>,
+        contract: &CheckedContract,
+        origin: &RowOrigin,
+    ) -> Result<Option<OpenSources>, ExplainError> {
+        let Some(open) = messages::sources(&origin.recording, question.logs, contract)? else {
+            return Ok(None);
+        };
+        let mut library = SchemaLibrary::builtin();
+        for folder in &contract.written.schemas {
+            // Types that are missing now only keep their channels from being shown.
+            library.add_folder(folder).ok();
+        }
+        let binding =
+            Binding::new(contract, &open.name, &open.channels, &library).map_err(|error| match error {
+                BindError::Run(error) => ExplainError::Run(error),
+                BindError::Refused(refusal) => {
+                    ExplainError::Log { path: question.dir.to_owned(), detail: refusal.to_string() }
+                }
+            })?;
+        Ok(Some(OpenSources { open, binding, library }))
+    }
+}
+
+/// Everything that an answer is made from.
+struct Explainer<'a> {
+    place: Place<'a>,
+    contract: &'a CheckedContract,
+    log: Option<&'a OpenSources>,
+}
+
+impl Explainer<'_> {
+    /// Writes the rule behind a value and the messages it was made from.
+    fn value(
+        &self,
+        text: &mut String,
+        target: &Target<'_>,
+        origin: &RowOrigin,
+        frame: u64,
+    ) -> Result<(), ExplainError> {
+        let derived = self.contract.streams.iter().find_map(|stream| match &stream.data {
+            StreamData::Derived { from, derivation } if stream.feature == target.feature.name => {
+                Some((from, *derivation))
+            }
+            _ => None,
+        });
+        match (derived, target.index) {
+            (Some((from, derivation)), Some(index)) => {
+                self.derived(text, (from, derivation), index, origin, frame)
+            }
+            _ => {
+                let columns: Vec<usize> = target.index.into_iter().collect();
+                self.measured(text, target.feature, &columns, origin);
+                Ok(())
+            }
+        }
+    }
+
+    /// Writes what an action made from two rows of a state was made from.
+    fn derived(
+        &self,
+        text: &mut String,
+        (from, derivation): (&str, Derivation),
+        index: usize,
+        origin: &RowOrigin,
+        frame: u64,
+    ) -> Result<(), ExplainError> {
+        writeln!(text, "  rule: derived from {from}: {}", describe::derivation(derivation)).ok();
+        let Some(feature) = self.place.meta.schema.features.iter().find(|feature| feature.name == from)
+        else {
+            return Ok(());
+        };
+        let columns: Vec<usize> = source_columns(feature, derivation, index).collect();
+        let next = frame + u64::from(!origin.is_last());
+        let frames = match derivation {
+            Derivation::Next => vec![next],
+            Derivation::Difference => vec![frame, next],
+        };
+        for frame in frames {
+            let mut inner = String::new();
+            let mut origin = None;
+            for &column in &columns {
+                let target = Target { feature, index: Some(column) };
+                let found = self.place.origin(frame, &target)?;
+                let value = found.value.map_or("an image".to_owned(), |value| format!("{value:?}"));
+                let valid = if found.is_valid { "valid" } else { "not valid" };
+                writeln!(inner, "{} in frame {frame}: {value}{}, {valid}", target.name(), unit_of(&target))
+                    .ok();
+                origin = Some(found);
+            }
+            if let Some(origin) = origin {
+                writeln!(inner, "  tick {} ns", origin.time_ns).ok();
+                self.measured(&mut inner, feature, &columns, &origin);
+            }
+            inner.lines().for_each(|line| {
+                writeln!(text, "  {line}").ok();
+            });
+        }
+        Ok(())
+    }
+
+    /// Writes the rule of the stream behind values of a feature, and the messages; no columns for an image.
+    fn measured(&self, text: &mut String, feature: &Feature, columns: &[usize], origin: &RowOrigin) {
+        let Some(log) = self.log else {
+            for stream in self.contract.streams.iter().filter(|stream| stream.feature == feature.name) {
+                let topic = stream.topic.as_ref().map(TopicPattern::as_str).unwrap_or_default();
+                describe::rule(text, stream, stream.name.as_deref().unwrap_or(topic), topic).ok();
+            }
+            return;
+        };
+        let Some((stream, columns)) = stream_of(&log.binding, &feature.name, columns) else { return };
+        let bound = &log.binding.streams[stream];
+        describe::rule(text, &bound.rule, &bound.name, &bound.topic).ok();
+        ages(text, origin, stream).ok();
+        let used = messages::around(&log.open, &log.binding, stream, self.contract, origin, &log.library);
+        messages::describe(text, bound, &columns, &used).ok();
+    }
+}
+
+/// Returns the values of a state that a value of an action derived from it is made of.
+fn source_columns(feature: &Feature, derivation: Derivation, index: usize) -> Range<usize> {
+    let FeatureData::Vector { parts, .. } = &feature.data else { return 0..0 };
+    if derivation == Derivation::Next {
+        return index..index + 1;
+    }
+    let (mut state, mut action) = (0, 0);
+    for part in parts {
+        let raw = part.kind.raw_width();
+        for _ in 0..part.dims.len() / raw {
+            let width = if raw > 1 { 3 } else { 1 };
+            if index < action + width {
+                return state..state + raw;
+            }
+            state += raw;
+            action += width;
+        }
+    }
+    0..0
 }
 
 fn target<'a>(features: &'a [Feature], name: &str) -> Result<Target<'a>, ExplainError> {
@@ -192,23 +351,25 @@ fn target<'a>(features: &'a [Feature], name: &str) -> Result<Target<'a>, Explain
     Err(ExplainError::Dim { dim: name.to_owned(), known })
 }
 
-/// Returns the stream that a value comes from, and which of its values it is.
-fn stream_of(binding: &Binding, target: &Target<'_>) -> Option<(usize, Option<usize>)> {
-    let streams = (0..binding.streams.len()).filter(|&at| binding.streams[at].feature == target.feature.name);
-    let Some(mut index) = target.index else { return streams.into_iter().next().map(|at| (at, None)) };
+/// Returns the stream that values of a feature come from, and which of its values they are.
+fn stream_of(binding: &Binding, feature: &str, columns: &[usize]) -> Option<(usize, Vec<usize>)> {
+    let mut streams = (0..binding.streams.len()).filter(|&at| binding.streams[at].feature == feature);
+    let Some(&first) = columns.first() else { return streams.next().map(|at| (at, Vec::new())) };
+    let mut start = 0;
     for at in streams {
         let stream: &BoundStream = &binding.streams[at];
         let StreamData::Vector(rule) = &stream.rule.data else { continue };
         let width = stream.columns.len() * rule.timing.map_or(1, crate::align::ActionTiming::commands);
-        if index < width {
-            return Some((at, Some(index % stream.columns.len())));
+        if first < start + width {
+            let columns = columns.iter().filter_map(|column| column.checked_sub(start));
+            return Some((at, columns.map(|column| column % stream.columns.len()).collect()));
         }
-        index -= width;
+        start += width;
     }
     None
 }
 
-fn row(
+fn head(
     text: &mut String,
     question: &Question<'_>,
     target: &Target<'_>,
@@ -235,51 +396,6 @@ fn unit_of(target: &Target<'_>) -> String {
     dim.map(|dim| format!(" {}", dim.unit.0)).filter(|unit| unit != " 1").unwrap_or_default()
 }
 
-fn rules_without_log(text: &mut String, contract: &CheckedContract, target: &Target<'_>) {
-    for stream in contract.streams.iter().filter(|stream| stream.feature == target.feature.name) {
-        let topic = stream.topic.as_ref().map(crate::contract::TopicPattern::as_str).unwrap_or_default();
-        // Writing to a text cannot fail.
-        rule(text, stream, topic).ok();
-    }
-}
-
-fn rule(text: &mut String, stream: &CheckedStream, topic: &str) -> std::fmt::Result {
-    let clock = match &stream.clock {
-        Clock::Stamp => "header stamp (publish time where there is none)".to_owned(),
-        Clock::Publish => "publish time".to_owned(),
-        Clock::Log => "log time".to_owned(),
-        Clock::Field(path) => format!("field {path}"),
-    };
-    let tolerance = stream
-        .tolerance_ns
-        .map_or("no tolerance".to_owned(), |ns| format!("tolerance {} ms", ns as f64 / 1e6));
-    writeln!(
-        text,
-        "  stream: {:?}, topic {topic}, clock: {clock}, offset {} ms",
-        stream.name.as_deref().unwrap_or_default(),
-        stream.offset_ns as f64 / 1e6
-    )?;
-    let how = match &stream.data {
-        StreamData::Vector(rule) => match rule.timing {
-            Some(timing) => format!("action {timing:?}"),
-            None => format!("{:?}", stream.align).to_lowercase(),
-        },
-        StreamData::Image(_) => format!("{:?}", stream.align).to_lowercase(),
-        StreamData::Derived { from, derivation } => format!("derived from {from}: {derivation:?}"),
-    };
-    writeln!(text, "  rule: {how}, {tolerance}, gap {:?}", stream.gap)?;
-    if let StreamData::Vector(rule) = &stream.data
-        && !rule.unit.is_identity()
-    {
-        writeln!(
-            text,
-            "  conversion: recorded * {} + {} = {}",
-            rule.unit.factor, rule.unit.offset, rule.unit.si.0
-        )?;
-    }
-    Ok(())
-}
-
 fn ages(text: &mut String, origin: &RowOrigin, stream: usize) -> std::fmt::Result {
     let shown = |ages: &[f32]| match ages.get(stream) {
         Some(age) if age.is_finite() => format!("{age} ms"),
@@ -300,7 +416,7 @@ fn encoding(text: &mut String, meta: &gawm_dataset::GawmMeta, target: &Target<'_
     };
     let kind =
         parts.iter().find(|part| part.dims.iter().any(|other| other.name == dim.name)).map(|part| part.kind);
-    writeln!(text, "  kind: {}", kind.map(shown_kind).unwrap_or_default()).ok();
+    writeln!(text, "  kind: {}", kind.map(describe::kind).unwrap_or_default()).ok();
     for (column, dims) in &meta.encodings {
         for (position, encoded) in dims.iter().enumerate() {
             if encoded.feature != target.feature.name || !encoded.raw_dims.contains(&dim.name) {
@@ -319,16 +435,12 @@ fn encoding(text: &mut String, meta: &gawm_dataset::GawmMeta, target: &Target<'_
             };
             writeln!(
                 text,
-                "  encoding: {column}[{position}] {:?} ({:?} of {}), {standardised}",
+                "  encoding: {column}[{position}] {:?} ({} of {}), {standardised}",
                 encoded.name,
-                encoded.encoding,
+                describe::encoding(encoded.encoding),
                 encoded.raw_dims.join(", ")
             )
             .ok();
         }
     }
-}
-
-fn shown_kind(kind: Kind) -> String {
-    format!("{kind:?}")
 }

@@ -7,9 +7,9 @@ use std::sync::Arc;
 use bytes::Bytes;
 
 use super::picture::{Picture, loss_reason};
-use super::plan::{ChannelPlan, Plans, Sinks, schema_of};
+use super::plan::{ChannelPlan, MappedTopic, Plans, Sinks, schema_of};
 use crate::decode::{CameraInfo, DecodeError, Decoded, RowSink, decode_to_json};
-use crate::log::{Block, Damage, Message, decompress_message, looks_like_zstd};
+use crate::log::{Block, Channel, Damage, Message, decompress_message, looks_like_zstd};
 
 /// Largest message that a compressed message may become.
 const MAX_MESSAGE_BYTES: u64 = 1 << 30;
@@ -18,13 +18,18 @@ const MAX_MESSAGE_BYTES: u64 = 1 << 30;
 #[derive(Debug, Default)]
 pub(crate) struct DecodedBlock {
     pub(crate) messages: Vec<DecodedMessage>,
-    /// Values that messages have ranges of.
+    /// Values that rows have ranges of.
     pub(crate) values: Vec<f64>,
+    /// Of each message and group the range of its values, and its stamp.
+    pub(crate) rows: Vec<Row>,
     /// Messages of topics that are not mapped.
     pub(crate) unmapped: Vec<(String, u64)>,
     /// What was lost or odd.
     pub(crate) damage: Vec<Damage>,
 }
+
+/// The range of the values that a group of streams has in a message, and their stamp.
+pub(crate) type Row = (Range<usize>, Option<i64>);
 
 /// One message of a mapped topic.
 #[derive(Debug)]
@@ -39,12 +44,42 @@ pub(crate) struct DecodedMessage {
     pub(crate) length: usize,
     /// File offset of the message or its chunk.
     pub(crate) offset: u64,
-    /// Range of the values of each group, and the stamp.
-    pub(crate) rows: Vec<(Range<usize>, Option<i64>)>,
+    /// Its rows in the block: one per group, none when it is lost.
+    rows: Range<usize>,
+    /// What few messages have.
+    extras: Option<Box<Extras>>,
+}
+
+/// What a message may hold beside numbers.
+#[derive(Debug, Default)]
+pub(crate) struct Extras {
+    /// Its image and the stamp of it.
     pub(crate) picture: Option<(Picture, Option<i64>)>,
+    /// The whole message, for markers and labels.
     pub(crate) event: Option<serde_json::Value>,
-    pub(crate) camera_info: Option<Box<CameraInfo>>,
+    pub(crate) camera_info: Option<CameraInfo>,
+    /// Why nothing else of it can be used.
     pub(crate) loss: Option<MessageLoss>,
+}
+
+impl DecodedMessage {
+    /// Returns the rows of the message, one per group of its topic.
+    pub(crate) fn rows<'a>(&self, block_rows: &'a [Row]) -> &'a [Row] {
+        block_rows.get(self.rows.clone()).unwrap_or_default()
+    }
+
+    pub(crate) fn picture(&self) -> Option<&(Picture, Option<i64>)> {
+        self.extras.as_ref()?.picture.as_ref()
+    }
+
+    pub(crate) fn loss(&self) -> Option<&MessageLoss> {
+        self.extras.as_ref()?.loss.as_ref()
+    }
+
+    /// Takes what few messages have.
+    pub(crate) fn take_extras(&mut self) -> Option<Box<Extras>> {
+        self.extras.take()
+    }
 }
 
 /// Why a message is lost.
@@ -56,6 +91,12 @@ pub(crate) struct MessageLoss {
     pub(crate) detail: String,
 }
 
+/// Images are shared with their block when they are together at least this part of it.
+const SHARED_PART: usize = 4;
+
+/// Values that room is made for beforehand, at most: what schemas promise need not come.
+const MAX_RESERVED: usize = 1 << 20;
+
 /// Decodes a block.
 pub(crate) fn decode_block(read: Block, plans: &Plans) -> DecodedBlock {
     let mut out = DecodedBlock::default();
@@ -63,16 +104,22 @@ pub(crate) fn decode_block(read: Block, plans: &Plans) -> DecodedBlock {
     let mut sinks: Vec<Vec<Sinks>> =
         by_channel.iter().map(|plan| plan.vectors.iter().map(|_| Sinks::default()).collect()).collect();
     let mut unmapped = vec![0_u64; read.channels.len()];
+    let is_image = |message: &&Message| by_channel[message.channel as usize].image.is_some();
+    let image_bytes: usize =
+        read.messages.iter().filter(is_image).map(|message| read.payload(message).len()).sum();
+    let is_shared = image_bytes >= read.data.len() / SHARED_PART;
     out.messages.reserve(read.messages.len());
+    out.rows.reserve(read.messages.len());
+    let n_values: usize = read.messages.iter().map(|m| by_channel[m.channel as usize].width).sum();
+    out.values.reserve(n_values.min(MAX_RESERVED));
     for message in &read.messages {
         let channel = message.channel as usize;
         let plan = &by_channel[channel];
         match plan.topic {
             None => unmapped[channel] += 1,
             Some(topic) => {
-                let decoded =
-                    decode_message(&read, message, plan, topic, plans, &mut sinks[channel], &mut out.values);
-                out.messages.push(decoded);
+                let decoder = MessageDecoder { block: &read, plan, topic, plans, is_shared };
+                decoder.decode(message, &mut sinks[channel], &mut out);
             }
         }
     }
@@ -85,119 +132,116 @@ pub(crate) fn decode_block(read: Block, plans: &Plans) -> DecodedBlock {
     out
 }
 
-fn decode_message(
-    block: &Block,
-    message: &Message,
-    plan: &ChannelPlan,
+/// What is known of a message before it is decoded.
+struct MessageDecoder<'a> {
+    block: &'a Block,
+    plan: &'a ChannelPlan,
     topic: usize,
-    plans: &Plans,
-    sinks: &mut [Sinks],
-    values: &mut Vec<f64>,
-) -> DecodedMessage {
-    let payload = block.payload(message);
-    let log_ns = i64::try_from(message.log_time_ns).unwrap_or(i64::MAX);
-    let publish_ns = match i64::try_from(message.publish_time_ns) {
-        Ok(0) | Err(_) => log_ns,
-        Ok(ns) => ns,
-    };
-    let mut out = DecodedMessage {
-        topic,
-        sequence: message.sequence,
-        log_ns,
-        publish_ns,
-        crc: crc32fast::hash(payload),
-        length: payload.len(),
-        offset: message.offset,
-        rows: Vec::new(),
-        picture: None,
-        event: None,
-        camera_info: None,
-        loss: None,
-    };
-    let channel = block.channel(message);
-    let start = values.len();
-    let is_compressed = channel.message_encoding == "cdr" && looks_like_zstd(payload);
-    let payload = if is_compressed {
-        match decompress_message(payload, MAX_MESSAGE_BYTES) {
-            Ok(bytes) => Cow::Owned(bytes),
-            Err(error) => {
-                out.loss = Some(MessageLoss { reason: "compressed_message", detail: error.to_string() });
-                return out;
+    plans: &'a Plans,
+    /// Whether images share the memory of the block.
+    is_shared: bool,
+}
+
+impl MessageDecoder<'_> {
+    fn decode(&self, message: &Message, sinks: &mut [Sinks], out: &mut DecodedBlock) {
+        let payload = self.block.payload(message);
+        let log_ns = i64::try_from(message.log_time_ns).unwrap_or(i64::MAX);
+        let publish_ns = match i64::try_from(message.publish_time_ns) {
+            Ok(0) | Err(_) => log_ns,
+            Ok(ns) => ns,
+        };
+        let (first_value, first_row) = (out.values.len(), out.rows.len());
+        let result = self.fill(message, payload, sinks, out);
+        let extras = match result {
+            Ok(extras) => extras,
+            Err(loss) => {
+                out.values.truncate(first_value);
+                out.rows.truncate(first_row);
+                Some(Box::new(Extras { loss: Some(loss), ..Extras::default() }))
+            }
+        };
+        out.messages.push(DecodedMessage {
+            topic: self.topic,
+            sequence: message.sequence,
+            log_ns,
+            publish_ns,
+            crc: crc32fast::hash(payload),
+            length: payload.len(),
+            offset: message.offset,
+            rows: first_row..out.rows.len(),
+            extras,
+        });
+    }
+
+    fn fill(
+        &self,
+        message: &Message,
+        payload: &[u8],
+        sinks: &mut [Sinks],
+        out: &mut DecodedBlock,
+    ) -> Result<Option<Box<Extras>>, MessageLoss> {
+        let channel = self.block.channel(message);
+        let is_compressed = channel.message_encoding == "cdr" && looks_like_zstd(payload);
+        let payload = if is_compressed {
+            let bytes = decompress_message(payload, MAX_MESSAGE_BYTES)
+                .map_err(|error| MessageLoss { reason: "compressed_message", detail: error.to_string() })?;
+            Cow::Owned(bytes)
+        } else {
+            Cow::Borrowed(payload)
+        };
+        if let Some(error) = &self.plan.error {
+            return Err(MessageLoss { reason: "undecodable", detail: error.to_string() });
+        }
+        for (decoder, sinks) in self.plan.vectors.iter().zip(sinks) {
+            sinks.rows.clear();
+            match decoder.decode(&payload, sinks).map_err(|error| loss_of(&error))? {
+                Decoded::Row { stamp_ns } => {
+                    let start = out.values.len();
+                    out.values.extend_from_slice(sinks.rows.values());
+                    out.rows.push((start..out.values.len(), stamp_ns));
+                }
+                Decoded::NotInMessage { .. } => out.rows.push((0..0, None)),
             }
         }
-    } else {
-        Cow::Borrowed(payload)
-    };
-    let whole = Payload { payload, block: &block.data };
-    if let Err(loss) = fill(&mut out, &whole, channel, plan, plans, sinks, values) {
-        values.truncate(start);
-        out.rows.clear();
-        out.loss = Some(loss);
+        let topic = &self.plans.topics[self.topic];
+        if self.plan.image.is_none() && !topic.is_event && !topic.is_camera_info {
+            return Ok(None);
+        }
+        self.extras(channel, topic, &payload).map(|extras| Some(Box::new(extras)))
     }
-    out
-}
 
-/// The bytes of a message and those of its block, which images may share.
-struct Payload<'a> {
-    payload: Cow<'a, [u8]>,
-    block: &'a Bytes,
-}
+    /// Decodes what is no row of numbers.
+    fn extras(&self, channel: &Channel, topic: &MappedTopic, payload: &[u8]) -> Result<Extras, MessageLoss> {
+        let mut extras = Extras::default();
+        if let Some(image) = &self.plan.image {
+            let message = image.extract(payload, &mut RowSink::new()).map_err(|error| loss_of(&error))?;
+            let stamp_ns = message.stamp_ns;
+            let picture = Picture::new(&message, image.kind(), |data| self.keep(data))
+                .map_err(|error| MessageLoss { reason: loss_reason(&error), detail: error.to_string() })?;
+            extras.picture = Some((picture, stamp_ns));
+        }
+        if topic.is_event {
+            let json = decode_to_json(&schema_of(channel), payload, self.plans.library());
+            extras.event = Some(json.map_err(|error| loss_of(&error))?);
+        }
+        if topic.is_camera_info {
+            let info = CameraInfo::decode(&schema_of(channel), payload, self.plans.library());
+            extras.camera_info = Some(info.map_err(|error| loss_of(&error))?);
+        }
+        Ok(extras)
+    }
 
-impl Payload<'_> {
-    /// Returns image bytes that outlive the block: shared when they are a large part of it, else copied.
+    /// Returns image bytes that outlive the block: shared with it, or copied when it is mostly something else.
     fn keep(&self, data: &[u8]) -> Bytes {
-        let block = self.block.as_ptr_range();
+        let block = self.block.data.as_ptr_range();
         let range = data.as_ptr_range();
         let is_inside = block.start <= range.start && range.end <= block.end;
-        if is_inside && data.len() >= self.block.len() / 4 {
-            self.block.slice_ref(data)
+        if is_inside && self.is_shared {
+            self.block.data.slice_ref(data)
         } else {
             Bytes::copy_from_slice(data)
         }
     }
-}
-
-fn fill(
-    out: &mut DecodedMessage,
-    whole: &Payload<'_>,
-    channel: &crate::log::Channel,
-    plan: &ChannelPlan,
-    plans: &Plans,
-    sinks: &mut [Sinks],
-    values: &mut Vec<f64>,
-) -> Result<(), MessageLoss> {
-    let payload: &[u8] = &whole.payload;
-    if let Some(error) = &plan.error {
-        return Err(MessageLoss { reason: "undecodable", detail: error.to_string() });
-    }
-    for (decoder, sinks) in plan.vectors.iter().zip(sinks) {
-        sinks.rows.clear();
-        match decoder.decode(payload, sinks).map_err(|error| loss_of(&error))? {
-            Decoded::Row { stamp_ns } => {
-                let start = values.len();
-                values.extend_from_slice(sinks.rows.values());
-                out.rows.push((start..values.len(), stamp_ns));
-            }
-            Decoded::NotInMessage { .. } => out.rows.push((0..0, None)),
-        }
-    }
-    if let Some(image) = &plan.image {
-        let message = image.extract(payload, &mut RowSink::new()).map_err(|error| loss_of(&error))?;
-        let stamp_ns = message.stamp_ns;
-        let picture = Picture::new(&message, image.kind(), |data| whole.keep(data))
-            .map_err(|error| MessageLoss { reason: loss_reason(&error), detail: error.to_string() })?;
-        out.picture = Some((picture, stamp_ns));
-    }
-    let topic = &plans.topics[out.topic];
-    if topic.is_event {
-        let json = decode_to_json(&schema_of(channel), payload, plans.library());
-        out.event = Some(json.map_err(|error| loss_of(&error))?);
-    }
-    if topic.is_camera_info {
-        let info = CameraInfo::decode(&schema_of(channel), payload, plans.library());
-        out.camera_info = Some(Box::new(info.map_err(|error| loss_of(&error))?));
-    }
-    Ok(())
 }
 
 fn loss_of(error: &DecodeError) -> MessageLoss {

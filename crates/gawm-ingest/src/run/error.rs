@@ -199,10 +199,16 @@ impl RunError {
             RunError::Write { source: gawm_dataset::WriteError::DiskFull { .. }, .. } => {
                 Some("make room and run the same command with --resume".to_owned())
             }
+            RunError::Write {
+                source: gawm_dataset::WriteError::Io { .. } | gawm_dataset::WriteError::Parquet { .. },
+                ..
+            } => Some("when the cause is gone, run the same command with --resume: finished recordings are not done again".to_owned()),
             RunError::Gap { .. } => {
                 Some("gap = \"split\" or \"mask\" goes on, a larger tolerance_ms bridges it".to_owned())
             }
             RunError::Interrupted => Some("run the same command with --resume to go on".to_owned()),
+            // The reasons bring their own.
+            RunError::Nothing { reasons } if reasons.iter().any(|reason| reason.contains("\nhint: ")) => None,
             RunError::Nothing { .. } => {
                 Some("`gawm-ingest inspect LOG` shows what the logs hold and what is damaged".to_owned())
             }

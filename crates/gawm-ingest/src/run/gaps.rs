@@ -1,29 +1,43 @@
 //! Gaps in words.
 
+use std::collections::BTreeMap;
+
 use super::RunError;
 use super::bind::Binding;
 use crate::align::{GapAction, GapEvent, Stop};
 
-/// Gaps that are described one by one.
-const LISTED: usize = 20;
+/// Gaps of a stream that are described one by one.
+const LISTED: usize = 5;
 
-/// Returns one line per gap; times are seconds after the start of the log.
+/// Returns a line per gap, of each stream the first few; times are seconds after the start of the log.
 pub(crate) fn describe(binding: &Binding, gaps: &[GapEvent], start_ns: i64) -> Vec<String> {
-    let mut lines: Vec<String> = gaps.iter().take(LISTED).map(|gap| line(binding, gap, start_ns)).collect();
-    if gaps.len() > LISTED {
-        lines.push(format!("{} more gaps, not listed", gaps.len() - LISTED));
+    let mut counts: BTreeMap<Option<usize>, usize> = BTreeMap::new();
+    let mut lines = Vec::new();
+    for gap in gaps {
+        let count = counts.entry(gap.stream).or_default();
+        *count += 1;
+        if *count <= LISTED {
+            lines.push(line(binding, gap, start_ns));
+        }
+    }
+    for (stream, count) in counts.into_iter().filter(|(_, count)| *count > LISTED) {
+        lines.push(format!("{}: {} gaps in all, the rest not listed", name_of(binding, stream), count));
     }
     lines
 }
 
-fn line(binding: &Binding, gap: &GapEvent, start_ns: i64) -> String {
-    let seconds = |ns: i64| ns.saturating_sub(start_ns) as f64 / 1e9;
-    let who = match gap.stream {
+fn name_of(binding: &Binding, stream: Option<usize>) -> String {
+    match stream {
         Some(stream) => {
             format!("stream {:?} ({})", binding.streams[stream].name, binding.streams[stream].topic)
         }
         None => "all streams".to_owned(),
-    };
+    }
+}
+
+fn line(binding: &Binding, gap: &GapEvent, start_ns: i64) -> String {
+    let seconds = |ns: i64| ns.saturating_sub(start_ns) as f64 / 1e9;
+    let who = name_of(binding, gap.stream);
     let rule = match gap.rule {
         GapAction::Split => "the episode is split",
         GapAction::Mask => "rows are masked",

@@ -162,6 +162,8 @@ pub(crate) struct ChannelPlan {
     pub(crate) topic: Option<usize>,
     /// One decoder per group.
     pub(crate) vectors: Vec<VectorDecoder>,
+    /// Values that a message gives.
+    pub(crate) width: usize,
     /// Takes images out.
     pub(crate) image: Option<ImagePlan>,
     /// Why the channel cannot be decoded.
@@ -220,9 +222,10 @@ impl Plans {
 
     fn compile(&self, channel: &Channel) -> ChannelPlan {
         let topic = self.index.get(&channel.topic).copied();
-        let mut plan = ChannelPlan { topic, vectors: Vec::new(), image: None, error: None };
+        let mut plan = ChannelPlan { topic, vectors: Vec::new(), width: 0, image: None, error: None };
         let Some(mapped) = topic.map(|topic| &self.topics[topic]) else { return plan };
         let schema = schema_of(channel);
+        plan.width = mapped.groups.iter().map(|group| group.width).sum();
         for group in &mapped.groups {
             match compile_vector(&schema, &group.fields, &group.clock, &self.library) {
                 Ok(decoder) if decoder.columns().len() == group.width => plan.vectors.push(decoder),

@@ -58,12 +58,12 @@ pub(crate) fn probe(
         for message in &block.messages {
             let topic = &plans.topics[message.topic];
             probed.read += u64::from(!topic.images.is_empty());
-            if let (Some(loss), false) = (&message.loss, topic.images.is_empty()) {
+            if let (Some(loss), false) = (message.loss(), topic.images.is_empty()) {
                 probed
                     .first_loss
                     .get_or_insert_with(|| format!("the first lost as {}: {}", loss.reason, loss.detail));
             }
-            if let Some((picture, _)) = &message.picture {
+            if let Some((picture, _)) = message.picture() {
                 for &stream in &topic.images {
                     if let StreamData::Image(rule) = &binding.streams[stream].rule.data {
                         probed.sizes.entry(stream).or_insert_with(|| picture.size(&rule.spec));
@@ -71,8 +71,8 @@ pub(crate) fn probe(
                 }
             }
             if let Some(stream) = reference.filter(|&stream| binding.streams[stream].topic == topic.topic) {
-                let stamp = message.picture.as_ref().and_then(|(_, stamp)| *stamp);
-                let stamp = stamp.or(message.rows.iter().find_map(|(_, stamp)| *stamp));
+                let stamp = message.picture().and_then(|(_, stamp)| *stamp);
+                let stamp = stamp.or(message.rows(&block.rows).iter().find_map(|(_, stamp)| *stamp));
                 times.push(match binding.streams[stream].rule.clock {
                     Clock::Log => message.log_ns,
                     Clock::Publish => message.publish_ns,

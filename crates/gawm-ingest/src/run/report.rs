@@ -135,7 +135,10 @@ impl Counts {
     }
 
     pub(crate) fn read(&mut self, topic: &str, count: u64) {
-        self.topics.entry(topic.to_owned()).or_default().read += count;
+        match self.topics.get_mut(topic) {
+            Some(counts) => counts.read += count,
+            None => self.topics.entry(topic.to_owned()).or_default().read = count,
+        }
     }
 
     pub(crate) fn lost(&mut self, topic: &str, reason: &str, count: u64, first: impl FnOnce() -> String) {

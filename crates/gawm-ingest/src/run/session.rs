@@ -1,9 +1,11 @@
 //! One recording on its way through the aligner: order, duplicates, clock resets, marks, counts.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, VecDeque};
+
+use gawm_schema::{FloatType, Kind, Role, rotation};
 
 use super::bind::Binding;
-use super::block::{DecodedBlock, DecodedMessage};
+use super::block::{DecodedBlock, DecodedMessage, Row};
 use super::picture::Picture;
 use super::plan::Plans;
 use super::report::Counts;
@@ -17,6 +19,9 @@ use crate::log::Damage;
 /// This many messages in a row of one topic, all before the disorder window, mean that its clock was reset.
 const RESET_MESSAGES: usize = 3;
 
+/// Image bytes that may wait for the disorder window to pass.
+const MAX_IMAGE_BYTES: usize = 192 << 20;
+
 /// Everything that is fixed for a recording.
 pub(crate) struct SessionRules<'a> {
     pub(crate) contract: &'a CheckedContract,
@@ -25,6 +30,8 @@ pub(crate) struct SessionRules<'a> {
     pub(crate) rule: &'a AlignRule,
     /// Expected size of the pictures of each stream, before crop and resize; learned from the first.
     pub(crate) label_fields: Vec<(String, String)>,
+    /// Whether records give the times of episodes, so that the time between them says nothing.
+    pub(crate) is_listed: bool,
 }
 
 /// The state of a recording.
@@ -46,7 +53,12 @@ pub(crate) struct Session<'a, 's> {
     reordered: u64,
     not_in_message: BTreeMap<String, u64>,
     unclosed: u64,
-    non_finite: BTreeMap<usize, u64>,
+    /// The disorder window where images had to leave memory earlier.
+    shortest_window_ns: i64,
+    /// Samples that cannot be used, by stream and what is wrong with them.
+    non_finite: BTreeMap<(usize, &'static str), u64>,
+    /// Values of a sample on their way to the aligner.
+    scratch: Vec<f64>,
     /// Usable samples per stream over all segments.
     pub(crate) samples: Vec<u64>,
 }
@@ -54,9 +66,43 @@ pub(crate) struct Session<'a, 's> {
 /// What is remembered of a topic.
 #[derive(Debug, Default, Clone)]
 struct Recent {
-    newest_ns: Option<i64>,
-    /// Messages within the disorder window.
-    seen: BTreeSet<(i64, u32, i64, u32, usize)>,
+    /// Messages within the disorder window, in order.
+    seen: VecDeque<MessageKey>,
+}
+
+/// Log time, sequence, publish time, CRC and length: two messages of a topic that share all are one written twice.
+type MessageKey = (i64, u32, i64, u32, usize);
+
+/// What a message is to those of its topic before it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Arrival {
+    InOrder,
+    OutOfOrder,
+    Duplicate,
+}
+
+impl Recent {
+    fn take(&mut self, key: MessageKey, window_ns: i64) -> Arrival {
+        let arrival = match self.seen.back() {
+            Some(newest) if *newest >= key => match self.seen.binary_search(&key) {
+                Ok(_) => return Arrival::Duplicate,
+                Err(at) => {
+                    let is_late = key.0 < newest.0;
+                    self.seen.insert(at, key);
+                    if is_late { Arrival::OutOfOrder } else { Arrival::InOrder }
+                }
+            },
+            _ => {
+                self.seen.push_back(key);
+                Arrival::InOrder
+            }
+        };
+        let low = self.seen.back().map_or(i64::MIN, |newest| newest.0.saturating_sub(window_ns));
+        while self.seen.front().is_some_and(|oldest| oldest.0 < low) {
+            self.seen.pop_front();
+        }
+        arrival
+    }
 }
 
 impl<'a, 's> Session<'a, 's> {
@@ -83,7 +129,9 @@ impl<'a, 's> Session<'a, 's> {
             reordered: 0,
             not_in_message: BTreeMap::new(),
             unclosed: 0,
+            shortest_window_ns: i64::MAX,
             non_finite: BTreeMap::new(),
+            scratch: Vec::new(),
             samples: vec![0; rules.rule.streams.len()],
         };
         session.open_segment();
@@ -155,12 +203,27 @@ impl<'a, 's> Session<'a, 's> {
                 let name = self.rules.plans.topics[*topic].topic.clone();
                 self.reset_clock(&name)?;
             }
-            self.take_message(message, &block.values);
+            self.take_message(message, &block.rows, &block.values);
         }
         let window = self.rules.contract.disorder_window_ns;
         let complete = complete_log_ns.or(self.newest_log_ns);
         if let Some(complete) = complete {
             self.advance(complete.saturating_sub(window))?;
+            self.limit_images(complete, window)?;
+        }
+        Ok(())
+    }
+
+    /// Makes rows before the disorder window is over, if its images take too much memory.
+    fn limit_images(&mut self, complete_ns: i64, window_ns: i64) -> Result<(), Stop> {
+        for eighth in 1..=8 {
+            let held_bytes: usize = self.aligner.images().map(Picture::held_bytes).sum();
+            if held_bytes <= MAX_IMAGE_BYTES {
+                break;
+            }
+            let left_ns = window_ns - window_ns / 8 * eighth;
+            self.shortest_window_ns = self.shortest_window_ns.min(left_ns);
+            self.advance(complete_ns.saturating_sub(left_ns))?;
         }
         Ok(())
     }
@@ -180,6 +243,14 @@ impl<'a, 's> Session<'a, 's> {
                 "{topic}: {count} messages hold none of the mapped elements, and were passed over"
             ));
         }
+        if self.shortest_window_ns < i64::MAX {
+            let text = format!(
+                "the images of disorder_window_ms take over {} MB, so the window was cut to {:.0} ms where needed: messages that come later than that are lost as beyond_disorder_window",
+                MAX_IMAGE_BYTES >> 20,
+                self.shortest_window_ns as f64 / 1e6
+            );
+            self.warn(text);
+        }
         if self.unclosed > 0 {
             let text = format!(
                 "{} episodes have no end mark; closed at the next start or at the end of the log",
@@ -187,10 +258,9 @@ impl<'a, 's> Session<'a, 's> {
             );
             self.warn(text);
         }
-        for (stream, count) in std::mem::take(&mut self.non_finite) {
+        for ((stream, defect), count) in std::mem::take(&mut self.non_finite) {
             let name = &self.rules.binding.streams[stream].name;
-            let text =
-                format!("stream {name:?}: {count} samples hold NaN or infinity; their rows are not valid");
+            let text = format!("stream {name:?}: {count} samples hold {defect}; their rows are not valid");
             self.warn(text);
         }
         Ok(())
@@ -267,12 +337,14 @@ impl<'a, 's> Session<'a, 's> {
         }
     }
 
-    fn take_message(&mut self, message: DecodedMessage, values: &[f64]) {
-        let name = self.rules.plans.topics[message.topic].topic.clone();
-        self.counts.read(&name, 1);
+    fn take_message(&mut self, mut message: DecodedMessage, rows: &[Row], values: &[f64]) {
+        let rules = self.rules;
+        let name = rules.plans.topics[message.topic].topic.as_str();
+        self.counts.read(name, 1);
         self.ordinal += 1;
         let window = self.rules.contract.disorder_window_ns;
         if let Some(newest) = self.newest_log_ns
+            && !self.rules.is_listed
             && message.log_ns.saturating_sub(newest) > self.rules.contract.max_gap_ns
         {
             let gap_s = message.log_ns.saturating_sub(newest) as f64 / 1e9;
@@ -281,26 +353,31 @@ impl<'a, 's> Session<'a, 's> {
             ));
         }
         self.newest_log_ns = Some(self.newest_log_ns.map_or(message.log_ns, |ns| ns.max(message.log_ns)));
-        let recent = &mut self.recent[message.topic];
         let key = (message.log_ns, message.sequence, message.publish_ns, message.crc, message.length);
-        if !recent.seen.insert(key) {
-            return self.counts.lost(&name, "duplicate", 1, || format!("offset {}", message.offset));
+        match self.recent[message.topic].take(key, window) {
+            Arrival::Duplicate => {
+                return self.counts.lost(name, "duplicate", 1, || format!("offset {}", message.offset));
+            }
+            Arrival::OutOfOrder => self.reordered += 1,
+            Arrival::InOrder => {}
         }
-        let newest = recent.newest_ns.map_or(message.log_ns, |ns| ns.max(message.log_ns));
-        self.reordered += u64::from(message.log_ns < newest);
-        if recent.seen.len() > 4096 {
-            let low = newest.saturating_sub(window);
-            recent.seen = recent.seen.split_off(&(low, 0, i64::MIN, 0, 0));
-        }
-        recent.newest_ns = Some(newest);
-        if let Some(loss) = &message.loss {
+        if let Some(loss) = message.loss() {
             return self
                 .counts
-                .lost(&name, loss.reason, 1, || format!("offset {}: {}", message.offset, loss.detail));
+                .lost(name, loss.reason, 1, || format!("offset {}: {}", message.offset, loss.detail));
         }
-        self.take_rows(&message, values, &name);
-        self.take_picture(&message, &name);
-        self.take_event(message, &name);
+        self.take_rows(&message, message.rows(rows), values, name);
+        if let Some(extras) = message.take_extras() {
+            if let Some((picture, stamp_ns)) = extras.picture {
+                self.take_picture(&message, &picture, stamp_ns, name);
+            }
+            if let Some(info) = extras.camera_info {
+                self.camera_infos.entry(name.to_owned()).or_insert(info);
+            }
+            if let Some(event) = extras.event {
+                self.take_event(&message, &event, name);
+            }
+        }
     }
 
     fn times(&self, stream: usize, message: &DecodedMessage, stamp_ns: Option<i64>) -> SampleTime {
@@ -315,34 +392,37 @@ impl<'a, 's> Session<'a, 's> {
         SampleTime { key_ns, clock_ns, log_ns: message.log_ns, ordinal: self.ordinal }
     }
 
-    fn take_rows(&mut self, message: &DecodedMessage, values: &[f64], name: &str) {
-        let topic = &self.rules.plans.topics[message.topic];
+    fn take_rows(&mut self, message: &DecodedMessage, rows: &[Row], values: &[f64], name: &str) {
+        let rules = self.rules;
+        let topic = &rules.plans.topics[message.topic];
         let mut late = None;
-        for (group, (range, stamp_ns)) in topic.groups.iter().zip(&message.rows) {
+        for (group, (range, stamp_ns)) in topic.groups.iter().zip(rows) {
             if range.is_empty() {
                 *self.not_in_message.entry(name.to_owned()).or_default() += 1;
                 continue;
             }
             let row = &values[range.clone()];
             for (stream, columns) in &group.streams {
-                let StreamData::Vector(vector) = &self.rules.binding.streams[*stream].rule.data else {
-                    continue;
-                };
-                let mut converted: Vec<f64> = row[columns.clone()].to_vec();
-                if !vector.unit.is_identity() {
-                    converted.iter_mut().for_each(|value| *value = vector.unit.apply(*value));
-                }
-                if converted.iter().any(|value| !value.is_finite()) {
-                    if self.rules.binding.streams[*stream].rule.non_finite == NonFiniteRule::Reject {
+                let rule = &rules.binding.streams[*stream].rule;
+                let StreamData::Vector(vector) = &rule.data else { continue };
+                let mut converted = std::mem::take(&mut self.scratch);
+                converted.clear();
+                converted.extend(row[columns.clone()].iter().map(|&value| vector.unit.apply(value)));
+                let is_encoded = matches!(rule.role, Role::State | Role::Action);
+                let is_float32 = is_encoded || rules.contract.written.float == FloatType::Float32;
+                if let Some(defect) = defect_of(&mut converted, vector.kind, (is_encoded, is_float32)) {
+                    if rule.non_finite == NonFiniteRule::Reject {
+                        self.scratch = converted;
                         self.counts.lost(name, "non_finite", 1, || format!("offset {}", message.offset));
                         return;
                     }
-                    *self.non_finite.entry(*stream).or_default() += 1;
+                    *self.non_finite.entry((*stream, defect)).or_default() += 1;
                 }
                 let time = self.times(*stream, message, *stamp_ns);
                 if let Err(error) = self.aligner.push_values(*stream, time, &converted) {
                     late = Some(error);
                 }
+                self.scratch = converted;
             }
         }
         if let Some(late) = late {
@@ -357,8 +437,13 @@ impl<'a, 's> Session<'a, 's> {
         });
     }
 
-    fn take_picture(&mut self, message: &DecodedMessage, name: &str) {
-        let Some((picture, stamp_ns)) = &message.picture else { return };
+    fn take_picture(
+        &mut self,
+        message: &DecodedMessage,
+        picture: &Picture,
+        stamp_ns: Option<i64>,
+        name: &str,
+    ) {
         let rules = self.rules;
         for &stream in &rules.plans.topics[message.topic].images {
             let size = picture.recorded_size();
@@ -372,7 +457,7 @@ impl<'a, 's> Session<'a, 's> {
                 });
                 return;
             }
-            let time = self.times(stream, message, *stamp_ns);
+            let time = self.times(stream, message, stamp_ns);
             if let Err(late) = self.aligner.push_image(stream, time, picture.clone()) {
                 self.count_late(name, message, late);
                 return;
@@ -380,17 +465,13 @@ impl<'a, 's> Session<'a, 's> {
         }
     }
 
-    fn take_event(&mut self, message: DecodedMessage, name: &str) {
-        if let Some(info) = message.camera_info {
-            self.camera_infos.entry(name.to_owned()).or_insert(*info);
-        }
-        let Some(event) = message.event else { return };
+    fn take_event(&mut self, message: &DecodedMessage, event: &serde_json::Value, name: &str) {
         if let EpisodeRule::Marker { topic, field, start, stop, clock } = &self.rules.contract.episodes
             && topic == name
         {
             let marks = Marks { field: field.clone(), start: start.clone(), stop: stop.clone() };
             let stamp_ns = match clock {
-                Clock::Field(path) => crate::episodes::value_at(&event, path)
+                Clock::Field(path) => crate::episodes::value_at(event, path)
                     .and_then(|value| value.as_f64())
                     .map(|value| if value.abs() < 1e12 { value * 1e9 } else { value })
                     .map(|ns| ns as i64),
@@ -401,11 +482,45 @@ impl<'a, 's> Session<'a, 's> {
                 (Clock::Publish, _) => message.publish_ns,
                 _ => message.log_ns,
             };
-            if let Some(mark) = marks.read(&event) {
+            if let Some(mark) = marks.read(event) {
                 self.marks.insert((time_ns, self.ordinal), mark);
             }
         }
-        self.sink.recording.take(name, &self.rules.label_fields, message.log_ns, &event);
+        self.sink.recording.take(name, &self.rules.label_fields, message.log_ns, event);
+    }
+}
+
+/// Returns what keeps a sample from being used, if anything; it is then no number any more.
+///
+/// States and actions are encoded as 32-bit floats, and their rotations need a direction.
+fn defect_of(values: &mut [f64], kind: Kind, (is_encoded, is_float32): (bool, bool)) -> Option<&'static str> {
+    let defect = if values.iter().any(|value| !value.is_finite()) {
+        "NaN or infinity"
+    } else if is_float32 && values.iter().any(|value| !(*value as f32).is_finite()) {
+        "numbers beyond 32-bit floats"
+    } else if is_encoded && values.chunks_exact(kind.raw_width()).any(|element| !has_rotation(kind, element))
+    {
+        "quaternions or matrices that are no rotation"
+    } else {
+        return None;
+    };
+    if is_float32 {
+        values.fill(f64::NAN);
+    }
+    Some(defect)
+}
+
+fn has_rotation(kind: Kind, element: &[f64]) -> bool {
+    match kind {
+        Kind::Quaternion { .. } => {
+            element.iter().map(|value| value * value).sum::<f64>().sqrt() >= rotation::MIN_NORM
+        }
+        Kind::Matrix => {
+            let matrix: rotation::Matrix = std::array::from_fn(|at| element[at]);
+            rotation::determinant(&matrix) >= rotation::MIN_NORM
+                && rotation::matrix_from_six(rotation::six_from_matrix(&matrix)).is_some()
+        }
+        _ => true,
     }
 }
 

@@ -296,7 +296,11 @@ impl PendingRows {
             }
             let column = &mut self.vectors[vector];
             let values = &row.values[at..at + width];
-            let is_held = feature.role == Role::Action && values.iter().all(|value| value.is_finite());
+            // What is made of samples (steps, sums) may leave the range of the floats it is encoded as.
+            let is_encoded = matches!(feature.role, Role::State | Role::Action);
+            let is_usable = !is_encoded || values.iter().all(|value| (*value as f32).is_finite());
+            let valid = valid && is_usable;
+            let is_held = feature.role == Role::Action && is_usable;
             if valid || is_held {
                 column.values.extend_from_slice(values);
             } else {

@@ -58,9 +58,12 @@ pub(crate) fn joints(topic: &Topic, messages: &[Value], survey: &Survey) -> Opti
         (!names.is_empty()).then_some(names)
     };
     let all: Vec<Vec<String>> = messages.iter().filter_map(names_of).collect();
-    let first = all.first()?;
-    let mut common: Vec<String> =
-        first.iter().filter(|name| all.iter().all(|names| names.contains(name))).cloned().collect();
+    // Now and then a message has some of the joints only.
+    let longest = all.iter().map(Vec::len).max()?;
+    let first = all.iter().find(|names| names.len() == longest)?;
+    let is_usual =
+        |name: &&String| is_most(all.iter().filter(|names| names.contains(name)).count(), all.len());
+    let mut common: Vec<String> = first.iter().filter(is_usual).cloned().collect();
     common.dedup();
     let mut unique = common.clone();
     unique.sort();
@@ -69,7 +72,11 @@ pub(crate) fn joints(topic: &Topic, messages: &[Value], survey: &Survey) -> Opti
         return None;
     }
     let (known, order) = urdf::joints(&survey.urdf);
-    let is_shuffled = all.iter().any(|names| names != first);
+    let has_other_order = |names: &Vec<String>| {
+        let kept: Vec<&String> = names.iter().filter(|name| common.contains(name)).collect();
+        kept.len() == common.len() && kept.into_iter().ne(&common)
+    };
+    let is_shuffled = all.iter().any(has_other_order);
     if common.iter().all(|name| order.contains(name)) {
         common.sort_by_key(|name| order.iter().position(|other| other == name));
     } else if is_shuffled {
@@ -132,6 +139,10 @@ pub(crate) fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
     while at < fields.len() {
         let field = fields[at];
         if let Some((order, paths)) = quaternion_at(&fields[at..]) {
+            at += 4;
+            if !has_direction(&paths, messages) {
+                continue;
+            }
             groups.push(Group {
                 fields: paths,
                 kind: KindSpec::Quaternion,
@@ -140,7 +151,6 @@ pub(crate) fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
                 reason: format!("four numbers named x, y, z, w: a quaternion in {order} order"),
                 is_joints: false,
             });
-            at += 4;
             width += 4;
             continue;
         }
@@ -167,7 +177,9 @@ pub(crate) fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
             }),
         }
     }
-    for group in groups.iter_mut().filter(|group| group.kind == KindSpec::Rotvec && group.fields.len() % 3 != 0) {
+    for group in
+        groups.iter_mut().filter(|group| group.kind == KindSpec::Rotvec && group.fields.len() % 3 != 0)
+    {
         group.kind = KindSpec::Linear;
         "no three numbers of a rotation vector".clone_into(&mut group.reason);
     }
@@ -176,6 +188,17 @@ pub(crate) fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
         groups.extend(json_in_text(topic, messages));
     }
     groups
+}
+
+/// Returns whether a quaternion is one in most messages: sensors that do not know theirs send zeros.
+fn has_direction(paths: &[String], messages: &[Value]) -> bool {
+    let is_zero = |message: &&Value| {
+        paths.iter().all(|path| {
+            crate::episodes::value_at(message, path)
+                .is_none_or(|value| value.as_f64().is_none_or(|v| v == 0.0))
+        })
+    };
+    is_most(messages.len() - messages.iter().filter(is_zero).count(), messages.len())
 }
 
 fn quaternion_at(fields: &[&FieldInfo]) -> Option<(&'static str, Vec<String>)> {
@@ -225,7 +248,15 @@ fn fixed_path(field: &FieldInfo, messages: &[Value]) -> Option<(String, usize)> 
                 .flatten()
                 .max_by_key(|n| lengths.iter().filter(|other| **other == Some(**n)).count())?;
             let same = lengths.iter().filter(|length| **length == Some(*n)).count();
-            (*n > 0 && *n <= MAX_WIDTH && is_most(same, lengths.len()))
+            // Ranges of a scanner are infinite where nothing is hit: no row of them could be used.
+            let finite = messages
+                .iter()
+                .filter_map(|message| crate::episodes::value_at(message, base))
+                .filter(|items| {
+                    items.as_array().is_some_and(|items| items.iter().all(|item| !item.is_string()))
+                })
+                .count();
+            (*n > 0 && *n <= MAX_WIDTH && is_most(same, lengths.len()) && is_most(finite, lengths.len()))
                 .then(|| (format!("{base}[0:{n}]"), *n))
         }
         _ => None,

@@ -259,6 +259,9 @@ fn add_states(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Gu
             () if is_marker(groups, topic) => {
                 (None, "a flag that is switched at times: an annotation of each row")
             }
+            () if names::is_reward(&topic.channel.topic) => {
+                (None, "a reward by its name: an annotation of each row")
+            }
             () if is_joints(groups) => (Some(()), "joint states are the state"),
             () if has_joints && is_gripper(topic, groups) => {
                 (Some(()), "a gripper belongs to the state of the arm")
@@ -279,7 +282,7 @@ fn add_states(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Gu
                 shown_type(topic),
                 topic.messages
             )),
-            _ if is_marker(groups, topic) => {
+            _ if is_marker(groups, topic) || names::is_reward(&topic.channel.topic) => {
                 if !names::is_recording(&topic.channel.topic) {
                     let feature = format!("annotation.{feature}");
                     add_groups(suggestion, topic, groups, &feature, RoleSpec::Annotation, why);
@@ -295,7 +298,11 @@ fn add_states(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Gu
             ),
         }
     }
-    if !has_state && let Some((topic, groups)) = measured.iter().max_by_key(|(topic, _)| topic.messages) {
+    let is_candidate = |(topic, _): &&(&Topic, Vec<Group>)| !names::is_reward(&topic.channel.topic);
+    if !has_state
+        && let Some((topic, groups)) =
+            measured.iter().filter(is_candidate).max_by_key(|(topic, _)| topic.messages)
+    {
         add_groups(
             suggestion,
             topic,

@@ -8,6 +8,8 @@ const MAX_LAG_S: f64 = 0.6;
 const MAX_SPAN_S: f64 = 60.0;
 /// Half-width of the difference that stands for the derivative, in grid steps.
 const DIFFERENCE: usize = 5;
+/// A step this near to a turn is a wrapped angle.
+const WRAP_SLACK_RAD: f64 = 1.0;
 
 /// A series of one value: times in ns, ascending.
 #[derive(Debug, Clone, Default)]
@@ -36,8 +38,8 @@ pub(crate) fn following(command: &Series, state: &Series) -> Option<Following> {
         return None;
     }
     let n = (span_s / STEP_S) as usize;
-    let command = on_grid(command, start, n);
-    let state = on_grid(state, start, n);
+    let command = on_grid(command, &unwrapped(&command.values), start, n);
+    let state = on_grid(state, &unwrapped(&state.values), start, n);
     if command.iter().chain(&state).any(|value| !value.is_finite()) {
         return None;
     }
@@ -50,8 +52,26 @@ pub(crate) fn following(command: &Series, state: &Series) -> Option<Following> {
     }
 }
 
-/// Linear between samples.
-fn on_grid(series: &Series, start_ns: i64, n: usize) -> Vec<f64> {
+/// Takes steps of nearly a turn out of angles, so that nothing is put between the two ends of such a step.
+fn unwrapped(values: &[f64]) -> Vec<f64> {
+    let turn = 2.0 * std::f64::consts::PI;
+    let mut turns = 0.0;
+    let mut last = values.first().copied().unwrap_or_default();
+    values
+        .iter()
+        .map(|&value| {
+            let step = value - last;
+            if (step.abs() - turn).abs() < WRAP_SLACK_RAD {
+                turns -= turn.copysign(step);
+            }
+            last = value;
+            value + turns
+        })
+        .collect()
+}
+
+/// Linear between samples, whose values are given apart.
+fn on_grid(series: &Series, values: &[f64], start_ns: i64, n: usize) -> Vec<f64> {
     let mut at = 0;
     (0..n)
         .map(|k| {
@@ -59,21 +79,20 @@ fn on_grid(series: &Series, start_ns: i64, n: usize) -> Vec<f64> {
             while at + 1 < series.times_ns.len() && series.times_ns[at + 1] <= ns {
                 at += 1;
             }
-            let (a, b) = (at, (at + 1).min(series.values.len() - 1));
+            let (a, b) = (at, (at + 1).min(values.len() - 1));
             let width = (series.times_ns[b] - series.times_ns[a]) as f64;
             let share =
                 if width > 0.0 { ((ns - series.times_ns[a]) as f64 / width).clamp(0.0, 1.0) } else { 0.0 };
-            series.values[a] + (series.values[b] - series.values[a]) * share
+            values[a] + (values[b] - values[a]) * share
         })
         .collect()
 }
 
-/// Central differences, wrapped steps of angles left out; zero at the ends.
+/// Central differences; zero at the ends.
 fn differences(values: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; values.len()];
     for k in DIFFERENCE..values.len().saturating_sub(DIFFERENCE) {
-        let step = values[k + DIFFERENCE] - values[k - DIFFERENCE];
-        out[k] = if step.abs() > std::f64::consts::PI { 0.0 } else { step };
+        out[k] = values[k + DIFFERENCE] - values[k - DIFFERENCE];
     }
     out
 }
@@ -149,6 +168,15 @@ mod tests {
         let speed =
             |t: f64| 2.0 * (2.0 * t).cos() + 0.4 * 5.3 * (5.3 * t + 1.0).cos() - 1.1 * (11.0 * t).sin();
         check_following(&series(4.0, 2500, speed), &state, 0.04, true);
+    }
+
+    #[test]
+    fn wrapped_angles_are_followed_through_the_turn() {
+        let wrapped =
+            |x: f64| (x + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU) - std::f64::consts::PI;
+        let command = series(20.0, 500, |t| wrapped(3.0 + motion(t)));
+        let state = series(10.0, 1000, |t| wrapped(3.0 + motion(t - 0.04)));
+        check_following(&command, &state, 0.04, false);
     }
 
     #[test]

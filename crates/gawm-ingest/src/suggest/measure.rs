@@ -6,6 +6,7 @@ use std::ops::ControlFlow;
 use gawm_schema::Wrap;
 
 use super::Suggestion;
+use super::commands::{Follower, adopt_kinds};
 use super::lag::{Following, Series, following};
 use super::survey::Survey;
 use crate::contract::{
@@ -31,7 +32,7 @@ pub(crate) fn refine(suggestion: &mut Suggestion, survey: &Survey, library: &Sch
 }
 
 /// The values of one stream, by column.
-type StreamSeries = BTreeMap<usize, Vec<Series>>;
+pub(crate) type StreamSeries = BTreeMap<usize, Vec<Series>>;
 
 /// Drops streams whose fields do not compile after all, with the reason.
 fn remove_unbindable(suggestion: &mut Suggestion, survey: &Survey, library: &SchemaLibrary) {
@@ -62,8 +63,9 @@ fn read(suggestion: &Suggestion, survey: &Survey, library: &SchemaLibrary) -> Op
     let plans = Plans::new(&binding, &[], &[], library);
     let mut all: StreamSeries = BTreeMap::new();
     let _: ControlFlow<()> = survey.first.read(&plans, 1, |_, block| {
-        for message in block.messages.iter().filter(|message| message.loss.is_none()) {
-            for (group, (range, stamp_ns)) in plans.topics[message.topic].groups.iter().zip(&message.rows) {
+        for message in block.messages.iter().filter(|message| message.loss().is_none()) {
+            let rows = message.rows(&block.rows);
+            for (group, (range, stamp_ns)) in plans.topics[message.topic].groups.iter().zip(rows) {
                 if range.is_empty() {
                     continue;
                 }
@@ -130,7 +132,7 @@ fn split_by_wrap(suggestion: &mut Suggestion, series: &StreamSeries) {
 }
 
 /// Returns the interval that angles are wrapped to: told by jumps of nearly a turn.
-fn wrap_of(values: &[f64]) -> Wrap {
+pub(crate) fn wrap_of(values: &[f64]) -> Wrap {
     use std::f64::consts::PI;
     let has_jump = values.windows(2).any(|pair| ((pair[1] - pair[0]).abs() - 2.0 * PI).abs() < 1.0);
     let (low, high) =
@@ -155,59 +157,104 @@ fn time_actions(suggestion: &mut Suggestion, survey: &Survey, series: &StreamSer
         .map(|stream| (stream.kind, stream.wrap, stream.unit.clone()))
         .collect();
     let tick_hz = suggestion.contract.ticks.rate_hz.unwrap_or(10.0);
-    for (index, stream) in suggestion.contract.stream.iter_mut().enumerate() {
-        if stream.role != Some(RoleSpec::Action) || stream.topic.is_none() {
+    let mut followers: BTreeMap<usize, Vec<Option<Follower>>> = BTreeMap::new();
+    // The values of a message act at the same time, whichever streams they were shared out to.
+    let mut lags_of: BTreeMap<String, Vec<f64>> = BTreeMap::new();
+    for (index, stream) in suggestion.contract.stream.iter().enumerate() {
+        let Some(topic) = stream.topic.clone().filter(|_| stream.role == Some(RoleSpec::Action)) else {
             continue;
-        }
+        };
         let columns = series.get(&index).map_or(&[][..], Vec::as_slice);
-        let found: Vec<(usize, Following)> = columns
+        let followed: Vec<Option<Follower>> = columns
             .iter()
-            .take(MAX_COLUMNS)
-            .filter_map(|column| best_state(column, &states, series))
+            .enumerate()
+            .map(|(at, column)| (at < MAX_COLUMNS).then(|| best_state(column, &states, series)).flatten())
             .collect();
-        let reasons = &mut suggestion.stream_reasons[index];
-        let topic = stream.topic.as_deref().and_then(|topic| survey.topics.get(topic));
-        let rate_hz = topic.map_or(0.0, super::survey::Topic::rate_hz);
-        apply(stream, reasons, &found, columns.len(), &kinds, (rate_hz, tick_hz));
+        let lags = followed.iter().flatten().map(|follower| follower.following.lag_s * 1e3);
+        lags_of.entry(topic).or_default().extend(lags);
+        followers.insert(index, followed);
     }
+    for (&index, followed) in &followers {
+        let stream = &mut suggestion.contract.stream[index];
+        let topic = stream.topic.clone().unwrap_or_default();
+        let found: Vec<(usize, Following)> =
+            followed.iter().flatten().map(|follower| (follower.stream, follower.following)).collect();
+        let measured = Measured {
+            found: &found,
+            n_columns: followed.len(),
+            lags_ms: lags_of.get(&topic).map_or(&[][..], Vec::as_slice),
+            rate_hz: survey.topics.get(&topic).map_or(0.0, super::survey::Topic::rate_hz),
+            tick_hz,
+        };
+        apply(stream, &mut suggestion.stream_reasons[index], &measured, &kinds);
+    }
+    followers.retain(|index, followed| {
+        is_position(&suggestion.contract.stream[*index], followed) && followed.len() <= MAX_COLUMNS
+    });
+    adopt_kinds(suggestion, &followers, series);
+}
+
+/// What was measured of a command.
+struct Measured<'a> {
+    /// State streams that follow its columns, and how.
+    found: &'a [(usize, Following)],
+    n_columns: usize,
+    /// Delays of all columns of its topic.
+    lags_ms: &'a [f64],
+    /// Commands per second.
+    rate_hz: f64,
+    /// Rows per second.
+    tick_hz: f64,
+}
+
+fn is_velocity(stream: &StreamSpec, n_velocity: usize, n_found: usize) -> bool {
+    let name = stream.topic.as_deref().unwrap_or_default();
+    !super::names::is_delta(name)
+        && (2 * n_velocity > n_found || (n_found == 0 && super::names::is_velocity(name)))
+}
+
+/// Returns whether a command may be one of positions: neither of steps nor of velocities.
+fn is_position(stream: &StreamSpec, followed: &[Option<Follower>]) -> bool {
+    let found = followed.iter().flatten();
+    let n_velocity = found.clone().filter(|follower| follower.following.is_velocity).count();
+    !super::names::is_delta(stream.topic.as_deref().unwrap_or_default())
+        && !is_velocity(stream, n_velocity, found.count())
 }
 
 /// Returns the state column that follows a command best.
-fn best_state(command: &Series, states: &[usize], series: &StreamSeries) -> Option<(usize, Following)> {
-    let mut best: Option<(usize, Following)> = None;
-    for &state in states {
-        for column in &series[&state] {
-            if let Some(found) = following(command, column)
-                && best.is_none_or(|(_, other)| found.correlation > other.correlation)
+fn best_state(command: &Series, states: &[usize], series: &StreamSeries) -> Option<Follower> {
+    let mut best: Option<Follower> = None;
+    for &stream in states {
+        for (column, state) in series[&stream].iter().enumerate() {
+            if let Some(following) = following(command, state)
+                && best.is_none_or(|other| following.correlation > other.following.correlation)
             {
-                best = Some((state, found));
+                best = Some(Follower { stream, column, following });
             }
         }
     }
-    best.filter(|(_, found)| found.correlation >= MIN_CORRELATION)
+    best.filter(|best| best.following.correlation >= MIN_CORRELATION)
 }
 
+/// Sets offset and timing.
 fn apply(
     stream: &mut StreamSpec,
     reasons: &mut Vec<String>,
-    found: &[(usize, Following)],
-    n_columns: usize,
+    measured: &Measured<'_>,
     kinds: &[(KindSpec, Option<Wrap>, Option<String>)],
-    (rate_hz, tick_hz): (f64, f64),
 ) {
+    let Measured { found, n_columns, rate_hz, tick_hz, .. } = *measured;
     let commands_per_tick = rate_hz / tick_hz;
-    let name = stream.topic.clone().unwrap_or_default();
-    let is_delta = super::names::is_delta(&name);
+    let is_delta = super::names::is_delta(stream.topic.as_deref().unwrap_or_default());
     let n_velocity = found.iter().filter(|(_, following)| following.is_velocity).count();
-    let is_velocity =
-        !is_delta && (2 * n_velocity > found.len() || (found.is_empty() && super::names::is_velocity(&name)));
+    let is_velocity = is_velocity(stream, n_velocity, found.len());
     let is_told = 2 * found.len() >= n_columns.max(1);
     if is_told {
-        let mut lags: Vec<f64> = found.iter().map(|(_, following)| following.lag_s * 1e3).collect();
+        let mut lags = measured.lags_ms.to_vec();
         lags.sort_by(f64::total_cmp);
         // A step acts over the period after its command, so what is measured is later by half a period.
         let half_ms = if is_delta && rate_hz > 0.0 { 500.0 / rate_hz } else { 0.0 };
-        let lag_ms = (lags[lags.len() / 2] - half_ms).max(0.0);
+        let lag_ms = (lags.get(lags.len() / 2).copied().unwrap_or(0.0) - half_ms).max(0.0);
         let correlation = found.iter().map(|(_, f)| f.correlation).fold(f64::INFINITY, f64::min);
         let what = if is_delta {
             "step"
@@ -221,9 +268,6 @@ fn apply(
             "offset: the state follows this {what} command after {lag_ms:.1} ms (correlation of {} of {n_columns} columns at least {correlation:.2}), so it acts that much later",
             found.len()
         ));
-        if !is_velocity && !is_delta && stream.kind == KindSpec::Linear {
-            adopt_kind(stream, reasons, found, kinds);
-        }
     } else {
         reasons.push(
             "offset: no clear delay between this command and the state; 0 until you know better".to_owned(),
@@ -254,22 +298,6 @@ fn apply(
         }
     } else {
         reasons.push("timing: at most about one command per row: the one in force".to_owned());
-    }
-}
-
-/// A position command that follows joint angles is one of joint angles.
-fn adopt_kind(
-    stream: &mut StreamSpec,
-    reasons: &mut Vec<String>,
-    found: &[(usize, Following)],
-    kinds: &[(KindSpec, Option<Wrap>, Option<String>)],
-) {
-    let angles = found.iter().filter(|(state, _)| kinds[*state].0 == KindSpec::Angle).count();
-    if angles == found.len() && stream.unit.is_none() && angles > 0 {
-        reasons.push(
-            "kind: its columns follow joint angles, but a command may hold others too, so it is left linear; say kind = \"angle\" if all are"
-                .to_owned(),
-        );
     }
 }
 

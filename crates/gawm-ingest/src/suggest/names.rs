@@ -64,6 +64,10 @@ pub(crate) fn is_recording(name: &str) -> bool {
     has(name, &["recording", "record", "episode", "episodes", "is_recording", "rec", "trial", "demo"])
 }
 
+pub(crate) fn is_reward(name: &str) -> bool {
+    has(name, &["reward", "rewards", "return", "returns", "terminated", "truncated"])
+}
+
 pub(crate) fn is_task(name: &str) -> bool {
     has(name, &["task", "tasks", "instruction", "instructions", "prompt", "language", "goal_text"])
 }
@@ -111,6 +115,10 @@ pub(crate) fn is_bookkeeping(path: &str) -> bool {
                 | "index"
                 | "frame_id"
                 | "counter"
+                | "sequenceNumber"
+                | "sequence_number"
+                | "sequence_num"
+                | "seq_num"
         )
         || path.contains("covariance")
 }

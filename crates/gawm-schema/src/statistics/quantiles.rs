@@ -101,7 +101,7 @@ impl QuantileSketch {
                 self.levels.push(Vec::new());
             }
             let mut values = std::mem::take(&mut self.levels[height]);
-            values.sort_unstable_by(f64::total_cmp);
+            sort(&mut values);
             // An odd one out stays, so that weights add up to the count.
             let kept = if values.len() % 2 == 1 { values.pop() } else { None };
             let offset = usize::from(self.flip());
@@ -121,6 +121,16 @@ impl QuantileSketch {
     }
 }
 
+/// Sorts as [`f64::total_cmp`] does, by integers, which compare faster.
+fn sort(values: &mut [f64]) {
+    // The order of the bits is that of the numbers once those of negative numbers are turned over, but for the sign;
+    // the same operation turns them back.
+    let turned = |bits: i64| bits ^ (((bits >> 63) as u64) >> 1) as i64;
+    let mut keys: Vec<i64> = values.iter().map(|value| turned(value.to_bits() as i64)).collect();
+    keys.sort_unstable();
+    values.iter_mut().zip(keys).for_each(|(value, key)| *value = f64::from_bits(turned(key) as u64));
+}
+
 /// Returns the value at rank (total - 1) * fraction of sorted, weighted items.
 fn interpolated(items: &[(f64, u64)], total: u64, fraction: f64) -> f64 {
     let rank = (total - 1) as f64 * fraction;
@@ -136,4 +146,19 @@ fn interpolated(items: &[(f64, u64)], total: u64, fraction: f64) -> f64 {
     let second = at(low as u64 + 1).or(items.last()).map_or(0.0, |item| item.0);
     let t = rank - low;
     if t == 0.0 || first == second { first } else { first + (second - first) * t }
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn sorts_as_total_cmp_does() {
+        let mut values =
+            vec![0.0, -0.0, 1.5, -1.5, f64::MAX, f64::MIN, 5e-324, -5e-324, 1e-300, -1e300, 7.0, 7.0];
+        values.extend((0..200).map(|k| f64::from(k * 7919 % 211 - 100) * 0.37));
+        let mut expected = values.clone();
+        expected.sort_by(f64::total_cmp);
+        super::sort(&mut values);
+        let bits = |values: &[f64]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
+        assert_eq!(bits(&values), bits(&expected));
+    }
 }
