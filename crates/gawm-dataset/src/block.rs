@@ -123,7 +123,12 @@ impl RowBlock {
                 raw.clear();
                 row_out.clear();
                 for &(vector, width) in &plan.inputs {
-                    raw.extend_from_slice(&rows.vectors[vector].values[row * width..(row + 1) * width]);
+                    let values = &rows.vectors[vector].values[row * width..(row + 1) * width];
+                    match columns.vectors[vector].dtype {
+                        // From what is stored, so that anyone who reads it gets the same bits.
+                        FloatType::Float32 => raw.extend(values.iter().map(|&v| f64::from(v as f32))),
+                        FloatType::Float64 => raw.extend_from_slice(values),
+                    }
                 }
                 plan.encoder.encode(&raw, &mut row_out)?;
                 encoded.extend_from_slice(&row_out);

@@ -1,14 +1,23 @@
 //! The command line of `gawm-data`.
 
 mod diff;
+mod edit;
+mod filter;
+mod merge;
+mod preview;
+mod progress;
 mod report;
+mod split;
 mod standardize;
 mod stats;
+mod trim;
 mod validate;
 
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+
+use crate::edit::EditError;
 
 /// Finished, but a check failed at the asked level, or input was refused.
 pub(crate) const EXIT_CHECK_FAILED: u8 = 3;
@@ -32,6 +41,11 @@ enum Verb {
     Validate(validate::ValidateArguments),
     Stats(stats::StatsArguments),
     Report(report::ReportArguments),
+    Preview(preview::PreviewArguments),
+    Filter(filter::FilterArguments),
+    Trim(trim::TrimArguments),
+    Merge(merge::MergeArguments),
+    Split(split::SplitArguments),
     Diff(diff::DiffArguments),
     Standardize(standardize::StandardizeArguments),
 }
@@ -51,11 +65,17 @@ pub fn run(arguments: impl IntoIterator<Item = std::ffi::OsString>) -> ExitCode 
         // A pool that is already there, in tests, stays as it is.
         rayon::ThreadPoolBuilder::new().num_threads(n).build_global().ok();
     }
+    let quiet = arguments.quiet;
     let outcome = match &arguments.verb {
-        Verb::Validate(verb) => validate::run(verb, arguments.quiet),
-        Verb::Stats(verb) => stats::run(verb),
-        Verb::Report(verb) => report::run(verb),
-        Verb::Diff(verb) => diff::run(verb),
+        Verb::Validate(verb) => validate::run(verb, quiet),
+        Verb::Stats(verb) => stats::run(verb, quiet),
+        Verb::Report(verb) => report::run(verb, quiet),
+        Verb::Preview(verb) => preview::run(verb, quiet),
+        Verb::Filter(verb) => filter::run(verb, quiet),
+        Verb::Trim(verb) => trim::run(verb, quiet),
+        Verb::Merge(verb) => merge::run(verb, quiet),
+        Verb::Split(verb) => split::run(verb, quiet),
+        Verb::Diff(verb) => diff::run(verb, quiet),
         Verb::Standardize(verb) => standardize::run(verb),
     };
     match outcome {
@@ -93,7 +113,10 @@ impl Failure {
 
 impl<E: Into<anyhow::Error>> From<E> for Failure {
     fn from(error: E) -> Self {
-        Failure { error: error.into(), code: 1, hint: None }
+        let error = error.into();
+        let (hint, is_usage) =
+            error.downcast_ref::<EditError>().map_or((None, false), |e| (e.hint(), e.is_usage()));
+        Failure { error, code: if is_usage { 2 } else { 1 }, hint }
     }
 }
 
@@ -125,7 +148,9 @@ pub(crate) fn open(dir: &std::path::Path) -> Result<crate::read::Dataset, Failur
 /// Replaces a file as a whole: written beside it, synced, renamed.
 pub(crate) fn write_replacing(path: &std::path::Path, bytes: &[u8]) -> std::io::Result<()> {
     use std::io::Write;
-    let folder = path.parent().unwrap_or_else(|| std::path::Path::new("."));
+    // The parent of a bare name is empty.
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+    let folder = folder.unwrap_or_else(|| std::path::Path::new("."));
     let mut file = tempfile::NamedTempFile::new_in(folder)?;
     file.write_all(bytes)?;
     file.as_file().sync_all()?;

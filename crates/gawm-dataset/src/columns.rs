@@ -170,7 +170,7 @@ impl Columns {
     /// Image bytes are PLAIN and uncompressed with one page per frame, so that the offset index gives the position of
     /// each frame in the file.
     pub(crate) fn writer_properties(&self) -> WriterProperties {
-        let mut builder = numeric_properties();
+        let mut builder = image_properties(self.images.iter().map(|image| image.name.as_str()));
         for name in ["index", "frame_index", TIME_NS] {
             let path = ColumnPath::new(vec![name.to_owned()]);
             builder = builder
@@ -179,19 +179,6 @@ impl Columns {
         }
         for name in ["episode_index", "task_index"] {
             builder = builder.set_column_dictionary_enabled(ColumnPath::new(vec![name.to_owned()]), true);
-        }
-        for image in &self.images {
-            let path = ColumnPath::new(vec![image.name.clone(), "bytes".to_owned()]);
-            builder = builder
-                .set_column_encoding(path.clone(), ParquetEncoding::PLAIN)
-                .set_column_compression(path.clone(), Compression::UNCOMPRESSED)
-                .set_column_dictionary_enabled(path.clone(), false)
-                .set_column_statistics_enabled(path.clone(), EnabledStatistics::None)
-                .set_column_data_page_size_limit(path, 1);
-            let path = ColumnPath::new(vec![image.name.clone(), "path".to_owned()]);
-            builder = builder
-                .set_column_dictionary_enabled(path.clone(), false)
-                .set_column_statistics_enabled(path, EnabledStatistics::None);
         }
         builder.build()
     }
@@ -205,6 +192,27 @@ pub(crate) fn numeric_properties() -> parquet::file::properties::WriterPropertie
         .set_dictionary_enabled(false)
         .set_max_row_group_row_count(None)
         .set_statistics_enabled(EnabledStatistics::Chunk)
+}
+
+/// Returns [`numeric_properties`] with columns of images: PLAIN and uncompressed with one page per frame.
+pub(crate) fn image_properties<'a>(
+    images: impl Iterator<Item = &'a str>,
+) -> parquet::file::properties::WriterPropertiesBuilder {
+    let mut builder = numeric_properties();
+    for image in images {
+        let path = ColumnPath::new(vec![image.to_owned(), "bytes".to_owned()]);
+        builder = builder
+            .set_column_encoding(path.clone(), ParquetEncoding::PLAIN)
+            .set_column_compression(path.clone(), Compression::UNCOMPRESSED)
+            .set_column_dictionary_enabled(path.clone(), false)
+            .set_column_statistics_enabled(path.clone(), EnabledStatistics::None)
+            .set_column_data_page_size_limit(path, 1);
+        let path = ColumnPath::new(vec![image.to_owned(), "path".to_owned()]);
+        builder = builder
+            .set_column_dictionary_enabled(path.clone(), false)
+            .set_column_statistics_enabled(path, EnabledStatistics::None);
+    }
+    builder
 }
 
 /// Returns for each encoded dim the raw dim that stores the same bits.

@@ -68,6 +68,30 @@ impl FeatureStats {
         }
     }
 
+    /// Returns the statistics in an entry of LeRobot's `stats.json`, whatever shape its lists have.
+    pub(crate) fn from_json(value: &serde_json::Value) -> Option<FeatureStats> {
+        let mut stats = FeatureStats::default();
+        for (name, values) in value.as_object()? {
+            let mut numbers = Vec::new();
+            flatten(values, 0, &mut numbers);
+            match stats.slot(name) {
+                Some(slot) => *slot = numbers,
+                None if name == "count" => stats.count = numbers.first().map_or(0, |count| *count as u64),
+                None => {}
+            }
+        }
+        // Quantiles are newer than the rest.
+        let FeatureStats { min, max, mean, q01, q10, q50, q90, q99, .. } = &mut stats;
+        for (quantile, stand_in) in [(q01, &*min), (q10, min), (q50, mean), (q90, max), (q99, max)] {
+            if quantile.is_empty() {
+                quantile.clone_from(stand_in);
+            }
+        }
+        let width = stats.mean.len();
+        let is_whole = width > 0 && stats.named().iter().all(|(_, values)| values.len() == width);
+        is_whole.then_some(stats)
+    }
+
     /// Returns name and values of each statistic but the count.
     pub(crate) fn named(&self) -> [(&'static str, &[f64]); 9] {
         [
@@ -97,6 +121,16 @@ impl FeatureStats {
             "q99" => &mut self.q99,
             _ => return None,
         })
+    }
+}
+
+/// Collects the numbers in nested lists.
+fn flatten(value: &serde_json::Value, depth: usize, out: &mut Vec<f64>) {
+    match value {
+        serde_json::Value::Array(items) if depth < 5 => {
+            items.iter().take(4096).for_each(|item| flatten(item, depth + 1, out));
+        }
+        other => out.extend(other.as_f64()),
     }
 }
 

@@ -30,6 +30,8 @@ pub const EPISODES: &str = "meta/episodes/chunk-000/file-000.parquet";
 pub const GAWM: &str = "meta/gawm.json";
 /// Histograms, circular statistics, camera histograms.
 pub const STATISTICS: &str = "meta/gawm-statistics.json";
+/// What edits the dataset went through, the last one last; absent when there was none.
+pub const EDITS: &str = "meta/gawm-edits.json";
 /// Folder of files taken over from the logs.
 pub const ATTACHMENTS: &str = "meta/attachments";
 /// Folder of camera calibrations.

@@ -16,6 +16,11 @@ mod mp4;
 mod paths;
 mod scan;
 
+pub(crate) use episode_table::episode_statistics;
+pub(crate) use files::{guarded, open_parquet};
+pub(crate) use info::read_json;
+pub(crate) use paths::join_inside;
+
 pub use column::{Column, ColumnValues};
 pub use defect::{Defect, DefectKind};
 pub use episode_table::{EpisodeEntry, VideoSpan};
@@ -26,6 +31,8 @@ pub use mp4::{Mp4Error, VideoTrack, read_video_track};
 pub use scan::{EpisodeRows, ScanError};
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 
 /// Why a folder cannot be used at all.
 #[derive(Debug, thiserror::Error)]
@@ -117,6 +124,8 @@ pub struct Dataset {
     pub defects: Vec<Defect>,
     /// The bounds in force.
     pub limits: ReadLimits,
+    /// Rows that passes over the data have read so far, for those who watch.
+    pub rows_read: Arc<AtomicU64>,
 }
 
 impl Dataset {
@@ -164,6 +173,7 @@ impl Dataset {
             schema,
             defects,
             limits,
+            rows_read: Arc::default(),
         })
     }
 

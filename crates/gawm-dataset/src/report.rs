@@ -29,6 +29,8 @@ struct Material<'a> {
     options: ReportOptions,
 }
 
+/// Forbids the page to load anything, whatever a dataset managed to put into it.
+pub(crate) const POLICY: &str = "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:\">";
 const STYLE: &str = include_str!("report/style.css");
 const SCRIPT: &str = include_str!("report/sort.js");
 
@@ -49,7 +51,7 @@ pub fn render_report(dataset: &Dataset, options: ReportOptions) -> Result<String
     write!(
         page,
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
-         <meta name=\"color-scheme\" content=\"light dark\"><title>{title}: gawm report</title>\n<style>{STYLE}</style></head>\n<body>\n<header><h1>{title}</h1>"
+         {POLICY}<meta name=\"color-scheme\" content=\"light dark\"><title>{title}: gawm report</title>\n<style>{STYLE}</style></head>\n<body>\n<header><h1>{title}</h1>"
     )
     .ok();
     sections::overview(&material, &mut page);
@@ -65,7 +67,7 @@ pub fn render_report(dataset: &Dataset, options: ReportOptions) -> Result<String
 }
 
 /// Makes text safe inside HTML and its attributes.
-fn escape(text: &str) -> String {
+pub(crate) fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         match c {

@@ -14,6 +14,7 @@ use std::sync::Mutex;
 use gawm_schema::{DimStats, DimSummary};
 use serde::Serialize;
 
+pub(crate) use camera::camera_counts;
 pub use camera::{CameraSummary, camera_summaries};
 pub use difference::{Difference, DimDifference, difference};
 pub use motion::{MotionStats, MotionSummary};

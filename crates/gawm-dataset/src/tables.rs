@@ -39,7 +39,10 @@ pub(crate) fn episodes_table(episodes: &[EpisodeRecord], cameras: &[&str]) -> Re
     let mut columns = plain_columns(episodes);
     let features: Vec<&String> = episodes.first().map(|e| e.stats.keys().collect()).unwrap_or_default();
     for feature in features {
-        push_stats(&mut columns, episodes, feature, cameras.contains(&feature.as_str()));
+        let default = FeatureStats::default();
+        let stats: Vec<&FeatureStats> =
+            episodes.iter().map(|e| e.stats.get(feature).unwrap_or(&default)).collect();
+        columns.extend(stats_columns(feature, &stats, cameras.contains(&feature.as_str())));
     }
     let fields: Vec<Field> =
         columns.iter().map(|(name, array)| Field::new(name, array.data_type().clone(), false)).collect();
@@ -92,16 +95,14 @@ fn plain_columns(episodes: &[EpisodeRecord]) -> Vec<(String, ArrayRef)> {
     columns
 }
 
-fn push_stats(
-    columns: &mut Vec<(String, ArrayRef)>,
-    episodes: &[EpisodeRecord],
+/// Returns the columns `stats/<feature>/...` of an episode table; those of a camera have shape (3, 1, 1).
+pub(crate) fn stats_columns(
     feature: &str,
+    stats: &[&FeatureStats],
     is_camera: bool,
-) {
-    let default = FeatureStats::default();
-    let stats: Vec<&FeatureStats> =
-        episodes.iter().map(|e| e.stats.get(feature).unwrap_or(&default)).collect();
-    let names = default.named().map(|(name, _)| name);
+) -> Vec<(String, ArrayRef)> {
+    let mut columns = Vec::new();
+    let names = FeatureStats::default().named().map(|(name, _)| name);
     for (position, name) in names.into_iter().enumerate() {
         let values: Vec<&[f64]> = stats.iter().map(|s| s.named()[position].1).collect();
         let items: ArrayRef =
@@ -117,7 +118,8 @@ fn push_stats(
         columns.push((format!("stats/{feature}/{name}"), array));
     }
     let counts = int_array(stats.iter().map(|s| s.count as i64));
-    columns.push((format!("stats/{feature}/count"), list_of_ones(counts, episodes.len())));
+    columns.push((format!("stats/{feature}/count"), list_of_ones(counts, stats.len())));
+    columns
 }
 
 fn list_of_ones(items: ArrayRef, n_items: usize) -> ArrayRef {
@@ -128,7 +130,8 @@ fn list_of(offsets: OffsetBuffer<i32>, items: ArrayRef) -> ArrayRef {
     Arc::new(ListArray::new(item_field(items.data_type().clone()), offsets, items, None))
 }
 
-fn to_parquet(path: &Path, batch: Result<RecordBatch, ArrowError>) -> Result<Vec<u8>, WriteError> {
+/// Returns a table as Parquet.
+pub(crate) fn to_parquet(path: &Path, batch: Result<RecordBatch, ArrowError>) -> Result<Vec<u8>, WriteError> {
     let mut bytes = Vec::new();
     let write = || {
         let batch = batch?;

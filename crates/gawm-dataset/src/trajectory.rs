@@ -1,11 +1,10 @@
 //! The data contract: the only way into a dataset.
 
+use gawm_image::{FileFormat, ImageError, ImageHeader, read_header};
 use gawm_schema::{EncodeError, Encoder, Feature, FeatureData, ImageSpec, Kind, Role, Schema};
 use thiserror::Error;
 
-use crate::{
-    AgeColumns, ImageColumn, ImageFormat, ImageHeader, ImageHeaderError, Rows, VectorColumn, image_header,
-};
+use crate::{AgeColumns, ImageColumn, Rows, VectorColumn};
 
 /// Rows of one episode that keep the data contract of a schema. Not empty.
 #[derive(Debug, Clone, PartialEq)]
@@ -128,7 +127,7 @@ pub enum TrajectoryError {
         /// The row.
         row: usize,
         /// What is wrong.
-        source: ImageHeaderError,
+        source: ImageError,
     },
     /// An image has another size than declared.
     #[error(
@@ -332,14 +331,14 @@ fn check_images(
     check_length(feature, "frames", n_rows, column.frames.len())?;
     check_length(feature, "validity flags", n_rows, column.valid.len())?;
     for (row, frame) in column.frames.iter().enumerate() {
-        let got = image_header(frame).map_err(|source| TrajectoryError::Image {
+        let got = read_header(frame).map_err(|source| TrajectoryError::Image {
             feature: feature.to_owned(),
             row,
             source,
         })?;
-        let is_wrong_format = got.format == ImageFormat::Tiff && !spec.depth;
+        let is_wrong_format = got.format == FileFormat::Tiff && !spec.depth;
         if is_wrong_format
-            || (got.height, got.width, got.channels) != (spec.height, spec.width, spec.channels)
+            || (got.height, got.width, u32::from(got.channels)) != (spec.height, spec.width, spec.channels)
         {
             return Err(TrajectoryError::ImageSize {
                 feature: feature.to_owned(),

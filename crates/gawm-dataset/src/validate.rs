@@ -53,6 +53,8 @@ pub struct ValidateOptions {
     pub checks_images: bool,
     /// Whether a probe tests if pictures show the state (SEMANTIC-012).
     pub probes_targets: bool,
+    /// Most findings of one code that are listed; the others are counted.
+    pub max_listed: usize,
 }
 
 impl Default for ValidateOptions {
@@ -62,6 +64,7 @@ impl Default for ValidateOptions {
             window_rows: 16,
             checks_images: true,
             probes_targets: false,
+            max_listed: MAX_LISTED,
         }
     }
 }
@@ -153,7 +156,7 @@ pub fn examine(dataset: &Dataset, options: &ValidateOptions) -> Result<Examinati
     Ok(Examination {
         episodes: runs.iter().map(measures).collect(),
         action_lag: semantic::action_lag(&runs),
-        report: report(dataset, thresholds, windows, findings),
+        report: report(dataset, options, windows, findings),
     })
 }
 
@@ -181,7 +184,7 @@ fn window_yield(
 /// Fills in severities and hints, orders the findings and bounds their number.
 fn report(
     dataset: &Dataset,
-    thresholds: &Thresholds,
+    options: &ValidateOptions,
     windows: WindowYield,
     mut findings: Vec<Finding>,
 ) -> Report {
@@ -190,7 +193,7 @@ fn report(
         if finding.severity == Severity::Off {
             finding.severity = rule.map_or(Severity::Warning, |r| r.severity);
         }
-        if let Some(severity) = thresholds.severity.get(finding.code) {
+        if let Some(severity) = options.thresholds.severity.get(finding.code) {
             finding.severity = *severity;
         }
         finding.hint = rule.map_or("", |r| r.hint);
@@ -213,10 +216,10 @@ fn report(
     findings.retain(|f| {
         let n = listed.entry(f.code).or_default();
         *n += 1;
-        if *n > MAX_LISTED {
+        if *n > options.max_listed {
             *left_out.entry(f.code).or_default() += 1;
         }
-        *n <= MAX_LISTED
+        *n <= options.max_listed
     });
     let mut episodes: Vec<i64> = dataset.runs.iter().map(|r| r.episode_index).collect();
     episodes.sort_unstable();
@@ -256,4 +259,19 @@ pub fn dim_labels(dataset: &Dataset, column: &str) -> Vec<DimLabel> {
         is_angle: is_angle(d),
     };
     (0..layout.width()).map(label).collect()
+}
+
+/// Returns the columns that tell when the robot moves: states, or actions where there is none.
+pub(crate) fn motion_columns(dataset: &Dataset) -> Vec<String> {
+    let states = columns_of(dataset, layout::Purpose::State);
+    if states.is_empty() { action_columns(dataset) } else { states }
+}
+
+/// Returns the columns of actions.
+pub(crate) fn action_columns(dataset: &Dataset) -> Vec<String> {
+    columns_of(dataset, layout::Purpose::Action)
+}
+
+fn columns_of(dataset: &Dataset, purpose: layout::Purpose) -> Vec<String> {
+    layout::layouts(dataset).into_iter().filter(|l| l.purpose == purpose).map(|l| l.name).collect()
 }

@@ -1,6 +1,7 @@
 //! Writes a dataset recording by recording, episode by episode, piece by piece.
 
 mod attachments;
+mod contract;
 mod episode_rows;
 mod finish;
 mod open;

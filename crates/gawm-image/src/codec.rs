@@ -67,11 +67,11 @@ pub fn decode_rgb_into(bytes: &[u8], width: u32, height: u32, out: &mut [u8]) ->
     Ok(())
 }
 
-fn jpeg_error(error: &turbojpeg::Error) -> ImageError {
+pub(crate) fn jpeg_error(error: &turbojpeg::Error) -> ImageError {
     damaged(FileFormat::Jpeg, error.to_string())
 }
 
-fn decompressor() -> Result<Decompressor, ImageError> {
+pub(crate) fn decompressor() -> Result<Decompressor, ImageError> {
     let mut decompressor = Decompressor::new().map_err(|e| jpeg_error(&e))?;
     decompressor.set_scan_limit(MAX_SCANS).map_err(|e| jpeg_error(&e))?;
     Ok(decompressor)

@@ -30,7 +30,7 @@ pub struct ImageHeader {
     pub width: u32,
     /// Height in pixels.
     pub height: u32,
-    /// Channels in the file, alpha included.
+    /// Channels that a decoder finds, alpha included: a palette gives colour, of 3.
     pub channels: u8,
     /// Bits per channel.
     pub bits: u8,
@@ -101,7 +101,7 @@ pub(crate) fn expect_format(bytes: &[u8]) -> Result<FileFormat, ImageError> {
     sniff(bytes).ok_or_else(|| ImageError::UnknownFormat { start: bytes.iter().copied().take(8).collect() })
 }
 
-/// Reads the size of an image without decoding it. JPEG and PNG.
+/// Reads the size of an image without decoding it. JPEG, PNG and TIFF.
 ///
 /// # Errors
 /// [`ImageError`] if the bytes are no such file or the header is damaged.
@@ -109,6 +109,7 @@ pub fn read_header(bytes: &[u8]) -> Result<ImageHeader, ImageError> {
     match expect_format(bytes)? {
         FileFormat::Jpeg => jpeg_header(bytes).map(|(header, _)| header),
         FileFormat::Png => png_header(bytes),
+        FileFormat::Tiff => tiff_header(bytes),
         format => Err(ImageError::UnsupportedFormat { format }),
     }
 }
@@ -200,13 +201,52 @@ fn png_header(bytes: &[u8]) -> Result<ImageHeader, ImageError> {
     }
     let word = |at: usize| u32::from_be_bytes([chunk[at], chunk[at + 1], chunk[at + 2], chunk[at + 3]]);
     let channels = match chunk[17] {
-        0 | 3 => 1,
-        2 => 3,
+        0 => 1,
+        2 | 3 => 3,
         4 => 2,
         6 => 4,
         other => return Err(damaged(FileFormat::Png, format!("unknown colour type {other}"))),
     };
     Ok(ImageHeader { format: FileFormat::Png, width: word(8), height: word(12), channels, bits: chunk[16] })
+}
+
+/// Reads the first directory of a TIFF.
+fn tiff_header(bytes: &[u8]) -> Result<ImageHeader, ImageError> {
+    let is_little = bytes.first() == Some(&b'I');
+    let short =
+        |at: usize| damaged(FileFormat::Tiff, format!("the file ends within its header, at byte {at}"));
+    let word = |at: usize| -> Result<u16, ImageError> {
+        let pair =
+            bytes.get(at..at.saturating_add(2)).and_then(|b| b.try_into().ok()).ok_or_else(|| short(at))?;
+        Ok(if is_little { u16::from_le_bytes(pair) } else { u16::from_be_bytes(pair) })
+    };
+    let long = |at: usize| -> Result<u32, ImageError> {
+        let four =
+            bytes.get(at..at.saturating_add(4)).and_then(|b| b.try_into().ok()).ok_or_else(|| short(at))?;
+        Ok(if is_little { u32::from_le_bytes(four) } else { u32::from_be_bytes(four) })
+    };
+    let start = long(4)? as usize;
+    let (mut width, mut height, mut channels, mut bits) = (None, None, 1, 1);
+    for entry in 0..usize::from(word(start)?) {
+        let at = start.saturating_add(2 + entry * 12);
+        // A short value stands at the beginning of the field.
+        let value = if word(at.saturating_add(2))? == 3 { u32::from(word(at + 8)?) } else { long(at + 8)? };
+        match word(at)? {
+            256 => width = Some(value),
+            257 => height = Some(value),
+            // Of several channels the field says where their depths stand.
+            258 if long(at + 4)? == 1 => bits = value,
+            277 => channels = value,
+            _ => {}
+        }
+    }
+    match (width, height, u8::try_from(channels)) {
+        (Some(width), Some(height), Ok(channels)) => {
+            let bits = u8::try_from(bits).unwrap_or(u8::MAX);
+            Ok(ImageHeader { format: FileFormat::Tiff, width, height, channels, bits })
+        }
+        _ => Err(damaged(FileFormat::Tiff, "its first directory has no size")),
+    }
 }
 
 fn check_png_chunks(bytes: &[u8]) -> Result<(), ImageError> {

@@ -25,6 +25,7 @@ mod format;
 mod image;
 mod raw;
 mod resample;
+mod thumbnail;
 mod transform;
 
 #[cfg(test)]
@@ -37,4 +38,5 @@ pub use error::ImageError;
 pub use format::{FileFormat, ImageHeader, read_header, sniff, verify};
 pub use image::{Image, Limits, Pixels};
 pub use raw::{Layout, RawImage, decode_raw};
+pub use thumbnail::{Thumbnail, decode_thumbnail};
 pub use transform::{CropRect, crop, resize, to_gray8, to_rgb8};

@@ -1,12 +1,14 @@
 //! Frame encoders: what turns an image into a vector.
 
 use candle_core::{IndexOp, Tensor};
+use gawm_kernels::VitEncoder;
+use gawm_kernels::vit::VitShape;
 
 use crate::Result;
 use crate::config::Architecture;
 use crate::layers::{LayerNorm, Linear, attention, gelu, join_heads, split_heads};
 use crate::parameters::{Init, Parameters, Specs, weight};
-use crate::pass::Pass;
+use crate::pass::{Pass, Precision};
 use crate::position::resize_table;
 
 /// A frame encoder. One variant today; a frozen patch encoder (DINO-WM) becomes another, whose patches
@@ -22,7 +24,7 @@ impl Encoder {
     /// Returns one vector per image: [N, C, H, W] to [N, W'].
     pub fn forward(&self, images: &Tensor, pass: &Pass) -> Result<Tensor> {
         match self {
-            Encoder::Vit(vit) => vit.tokens(images, pass)?.i((.., 0)), // [N, W'], the class token
+            Encoder::Vit(vit) => vit.class_tokens(images, pass), // [N, W']
         }
     }
 
@@ -37,6 +39,8 @@ impl Encoder {
 /// Vision transformer (pre-norm) with a class token, as `transformers.ViTModel` without pooler.
 #[derive(Debug, Clone)]
 pub struct Vit {
+    /// The class token by fused operations; all else is the composed form of the same.
+    fused: VitEncoder,
     patch_size: usize,
     patch_projection: Linear,
     cls_token: Tensor,
@@ -58,6 +62,18 @@ struct Layer {
     fc1: Linear,
     fc2: Linear,
 }
+
+/// Parts of a layer in the order of [`gawm_kernels::vit::LAYER_PARAMETERS`].
+const FUSED_PARTS: [&str; 8] = [
+    "layernorm_before",
+    "attention.q_proj",
+    "attention.k_proj",
+    "attention.v_proj",
+    "attention.o_proj",
+    "layernorm_after",
+    "mlp.fc1",
+    "mlp.fc2",
+];
 
 impl Vit {
     /// Added to the variance in its layer norms.
@@ -101,6 +117,7 @@ impl Vit {
         let projection = "encoder.embeddings.patch_embeddings.projection";
         let kernel = parameters.get(&format!("{projection}.weight"))?.flatten_from(1)?; // [W, 3 x patch^2]
         Ok(Vit {
+            fused: Vit::fuse(parameters, config.depth)?,
             patch_size: config.patch_size,
             patch_projection: Linear::new(kernel, Some(parameters.get(&format!("{projection}.bias"))?)),
             cls_token: parameters.get("encoder.embeddings.cls_token")?,
@@ -113,18 +130,64 @@ impl Vit {
         })
     }
 
-    /// Encodes images to tokens: [N, 3, H, W] to [N, 1 + P, W'], class token first, patches row by row.
+    /// Hands the parameters to the fused encoder, in the order of [`gawm_kernels::vit`].
+    fn fuse(parameters: &Parameters, depth: usize) -> Result<VitEncoder> {
+        let projection = "encoder.embeddings.patch_embeddings.projection";
+        let mut names = vec![format!("{projection}.weight"), format!("{projection}.bias")];
+        names.push("encoder.embeddings.cls_token".to_owned());
+        names.extend(["weight", "bias"].map(|which| format!("encoder.layernorm.{which}")));
+        for layer in 0..depth {
+            for part in FUSED_PARTS {
+                names
+                    .extend(["weight", "bias"].map(|which| format!("encoder.layers.{layer}.{part}.{which}")));
+            }
+        }
+        let tensors = names.iter().map(|name| parameters.get(name)).collect::<Result<_>>()?;
+        Ok(VitEncoder::new(tensors, parameters.sink().clone()))
+    }
+
+    /// Encodes images to normalised class tokens: [N, 3, H, W] to [N, W'].
     ///
-    /// `P` is (H / patch) x (W / patch), rounded down as a convolution does; pixels beyond are not seen.
-    pub fn tokens(&self, images: &Tensor, pass: &Pass) -> Result<Tensor> {
-        let (n, c, height, width) = images.dims4()?;
+    /// By fused operations where they take the input, else the first of [`Vit::tokens`].
+    pub fn class_tokens(&self, images: &Tensor, pass: &Pass) -> Result<Tensor> {
+        if pass.precision != Precision::F32 || !VitEncoder::takes(images) {
+            return self.tokens(images, pass)?.i((.., 0)); // [N, W']
+        }
+        let (rows, columns) = self.grid(images)?;
+        let layer = self.layers.first();
+        let shape = VitShape {
+            patch: self.patch_size,
+            rows,
+            columns,
+            channels: images.dim(1)?,
+            width: self.cls_token.dim(2)?,
+            depth: self.layers.len(),
+            heads: layer.map_or(1, |layer| layer.heads),
+            mlp_width: layer.map_or(Ok(1), |layer| layer.fc1.outputs())?,
+            epsilon: Vit::EPSILON as f32,
+        };
+        self.fused.forward(images, &self.positions(rows, columns)?, shape, pass.training)
+    }
+
+    /// Rows and columns of whole patches in images [N, 3, H, W].
+    fn grid(&self, images: &Tensor) -> Result<(usize, usize)> {
+        let (_, _, height, width) = images.dims4()?;
         let p = self.patch_size;
-        let (rows, columns) = (height / p, width / p);
-        if rows == 0 || columns == 0 {
+        if height < p || width < p {
             candle_core::bail!(
                 "image is smaller than a patch: expected at least {p}x{p}, got {height}x{width}"
             );
         }
+        Ok((height / p, width / p))
+    }
+
+    /// Encodes images to tokens: [N, 3, H, W] to [N, 1 + P, W'], class token first, patches row by row.
+    ///
+    /// `P` is (H / patch) x (W / patch), rounded down as a convolution does; pixels beyond are not seen.
+    pub fn tokens(&self, images: &Tensor, pass: &Pass) -> Result<Tensor> {
+        let (n, c, _, _) = images.dims4()?;
+        let p = self.patch_size;
+        let (rows, columns) = self.grid(images)?;
         let images = images.i((.., .., ..rows * p, ..columns * p))?;
         let grid = images.reshape(&[n, c, rows, p, columns, p])?; // [N, C, rows, p, columns, p]
         let patches = grid.permute([0, 2, 4, 1, 3, 5])?; // [N, rows, columns, C, p, p]

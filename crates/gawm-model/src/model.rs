@@ -1,6 +1,7 @@
 //! The world model: modules joined, latents in and out.
 
 use candle_core::{Device, Tensor};
+use gawm_kernels::rollout::{Roller, RolloutShape, RolloutTensors};
 
 use crate::Result;
 use crate::action::ActionEmbedder;
@@ -26,6 +27,7 @@ pub struct WorldModel {
     pred_proj: Projector,
     state_probe: Option<StateProbe>,
     idm_head: Option<InverseDynamics>,
+    roller: Roller,
 }
 
 impl WorldModel {
@@ -72,6 +74,7 @@ impl WorldModel {
             pred_proj: Projector::load(&parameters, "pred_proj")?,
             state_probe,
             idm_head,
+            roller: roller(&parameters, &architecture)?,
             architecture,
             parameters,
         })
@@ -90,6 +93,11 @@ impl WorldModel {
     /// The frame encoder.
     pub fn encoder(&self) -> &Encoder {
         &self.encoder
+    }
+
+    /// Rolls latents forward by fused operations; [`rollout`](crate::plan::rollout) says when.
+    pub(crate) fn roller(&self) -> &Roller {
+        &self.roller
     }
 
     /// Encodes standardised frames to latents: [B, T, C, H, W] to [B, T, D].
@@ -141,3 +149,66 @@ impl WorldModel {
         }
     }
 }
+
+/// Hands what a roll-out needs to the fused form of it.
+fn roller(parameters: &Parameters, architecture: &Architecture) -> Result<Roller> {
+    let config = architecture.config();
+    let shape = RolloutShape {
+        history: config.predictor.history,
+        latent: config.latent_width,
+        action: architecture.widths().action,
+        heads: config.predictor.heads,
+        head_width: config.predictor.head_width,
+        plain_epsilon: crate::predictor::PLAIN_EPSILON as f32,
+        affine_epsilon: crate::predictor::AFFINE_EPSILON as f32,
+        batch_epsilon: crate::layers::BatchNorm::EPSILON as f32,
+    };
+    let tensors = RolloutTensors {
+        embedder: named(parameters, "action_encoder", EMBEDDER_PARTS)?,
+        positions: parameters.get("predictor.pos_embedding")?,
+        blocks: (0..config.predictor.depth)
+            .map(|block| named(parameters, &format!("predictor.transformer.layers.{block}"), BLOCK_PARTS))
+            .collect::<Result<_>>()?,
+        norm: named(parameters, "predictor.transformer.norm", ["weight", "bias"])?,
+        projector: named(parameters, "pred_proj.net", PROJECTOR_PARTS)?,
+    };
+    Ok(Roller::new(shape, tensors))
+}
+
+/// Returns the tensors `prefix.name`.
+fn named<const N: usize>(parameters: &Parameters, prefix: &str, names: [&str; N]) -> Result<[Tensor; N]> {
+    let tensors = names.iter().map(|name| parameters.get(&format!("{prefix}.{name}")));
+    let tensors: Vec<Tensor> = tensors.collect::<Result<_>>()?;
+    Ok(tensors.try_into().expect("one tensor per name"))
+}
+
+/// Tensors of the action embedder, in the order of [`RolloutTensors`].
+const EMBEDDER_PARTS: [&str; 6] = [
+    "patch_embed.weight",
+    "patch_embed.bias",
+    "embed.0.weight",
+    "embed.0.bias",
+    "embed.2.weight",
+    "embed.2.bias",
+];
+
+/// Tensors of a block, in the order of [`RolloutTensors`].
+const BLOCK_PARTS: [&str; 13] = [
+    "adaLN_modulation.1.weight",
+    "adaLN_modulation.1.bias",
+    "attn.norm.weight",
+    "attn.norm.bias",
+    "attn.to_qkv.weight",
+    "attn.to_out.0.weight",
+    "attn.to_out.0.bias",
+    "mlp.net.0.weight",
+    "mlp.net.0.bias",
+    "mlp.net.1.weight",
+    "mlp.net.1.bias",
+    "mlp.net.4.weight",
+    "mlp.net.4.bias",
+];
+
+/// Tensors of the projector, in the order of [`RolloutTensors`].
+const PROJECTOR_PARTS: [&str; 8] =
+    ["0.weight", "0.bias", "1.weight", "1.bias", "1.running_mean", "1.running_var", "3.weight", "3.bias"];

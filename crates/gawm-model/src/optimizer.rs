@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use candle_core::backprop::GradStore;
-use candle_core::{DType, Tensor, Var};
+use candle_core::{DType, Device, Shape, Tensor, Var};
+use gawm_kernels::adamw::{AdamWJob, AdamWStep, adamw, squared_norm};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -71,11 +71,19 @@ impl Gradients {
     ///
     /// A parameter that the loss does not reach has none.
     pub fn of(loss: &Tensor, parameters: &Parameters) -> Result<Gradients> {
-        let mut store: GradStore = loss.backward()?;
-        let named = parameters
-            .trainable()
-            .filter_map(|(name, variable)| Some((name.to_owned(), store.remove(variable.as_tensor())?)));
-        Ok(Gradients(named.collect()))
+        let (mut store, mut fused) = parameters.sink().collect(|| loss.backward())?;
+        let mut gradients = BTreeMap::new();
+        for (name, variable) in parameters.trainable() {
+            let gradient =
+                match (store.remove(variable.as_tensor()), fused.remove(&variable.as_tensor().id())) {
+                    (Some(a), Some(b)) => Some((a + b)?),
+                    (a, b) => a.or(b),
+                };
+            if let Some(gradient) = gradient {
+                gradients.insert(name.to_owned(), gradient);
+            }
+        }
+        Ok(Gradients(gradients))
     }
 
     /// Names and gradients, sorted by name.
@@ -90,6 +98,14 @@ impl Gradients {
 
     /// Returns the L2 norm over all gradients together, a scalar on the device.
     pub fn norm(&self) -> Result<Tensor> {
+        let device = match self.0.values().next() {
+            Some(gradient) => gradient.device(),
+            None => candle_core::bail!("expected at least one gradient to take the norm of, got none"),
+        };
+        if self.0.values().all(is_plain) {
+            let norm = squared_norm(&self.0.values().collect::<Vec<_>>())?.sqrt();
+            return Tensor::new(norm as f32, device);
+        }
         let squares = self.0.values().map(|gradient| gradient.to_dtype(DType::F32)?.sqr()?.sum_all());
         Tensor::stack(&squares.collect::<Result<Vec<_>>>()?, 0)?.sum_all()?.sqrt()
     }
@@ -152,9 +168,70 @@ impl From<ParameterError> for OptimizerError {
 
 /// First and second moment of a gradient, f32.
 #[derive(Debug, Clone)]
-struct Moments {
-    first: Tensor,
-    second: Tensor,
+enum Moments {
+    /// Of a parameter on the CPU, updated in place.
+    Host { shape: Shape, first: Vec<f32>, second: Vec<f32> },
+    /// Of a parameter elsewhere.
+    Device { first: Tensor, second: Tensor },
+}
+
+impl Moments {
+    fn zeros(variable: &Var) -> Result<Moments> {
+        if is_plain(variable.as_tensor()) {
+            let zeros = vec![0.0; variable.elem_count()];
+            let shape = variable.shape().clone();
+            return Ok(Moments::Host { shape, first: zeros.clone(), second: zeros });
+        }
+        let zeros = variable.as_detached_tensor().to_dtype(DType::F32)?.zeros_like()?;
+        Ok(Moments::Device { first: zeros.clone(), second: zeros })
+    }
+
+    /// Takes saved moments of the shape of `variable`.
+    fn restore(variable: &Var, first: &Tensor, second: &Tensor) -> Result<Moments> {
+        if is_plain(variable.as_tensor()) {
+            let values = |tensor: &Tensor| tensor.flatten_all()?.to_vec1::<f32>();
+            let shape = variable.shape().clone();
+            return Ok(Moments::Host { shape, first: values(first)?, second: values(second)? });
+        }
+        let device = variable.device();
+        Ok(Moments::Device { first: first.to_device(device)?, second: second.to_device(device)? })
+    }
+
+    /// Returns copies of both.
+    fn tensors(&self) -> (Tensor, Tensor) {
+        match self {
+            Moments::Host { shape, first, second } => {
+                let copy = |values: &Vec<f32>| {
+                    Tensor::from_slice(values, shape, &Device::Cpu)
+                        .expect("moments have as many values as the shape that they were made for")
+                };
+                (copy(first), copy(second))
+            }
+            Moments::Device { first, second } => (first.clone(), second.clone()),
+        }
+    }
+}
+
+/// The update of [`adamw`] in composed operations, for any device.
+fn composed_update(
+    step: &AdamWStep,
+    kept: f64,
+    variable: &Var,
+    gradient: &Tensor,
+    (first, second): (&mut Tensor, &mut Tensor),
+) -> Result<()> {
+    let (beta1, beta2) = (f64::from(step.beta1), f64::from(step.beta2));
+    let gradient = (gradient.to_dtype(DType::F32)? * f64::from(step.scale))?;
+    *first = ((&*first * beta1)? + (&gradient * (1.0 - beta1))?)?;
+    *second = ((&*second * beta2)? + (gradient.sqr()? * (1.0 - beta2))?)?;
+    let denominator = ((second.sqrt()? * f64::from(step.root))? + f64::from(step.epsilon))?;
+    let kept = (variable.as_detached_tensor() * kept)?;
+    variable.set(&(kept - ((&*first / denominator)? * f64::from(step.size))?)?)
+}
+
+/// Whether fused operations take a tensor.
+fn is_plain(tensor: &Tensor) -> bool {
+    tensor.device().is_cpu() && tensor.dtype() == DType::F32 && tensor.is_contiguous()
 }
 
 /// AdamW with decoupled decay, as torch computes it.
@@ -209,44 +286,67 @@ impl AdamW {
         }
         let scale = (self.config.max_gradient_norm / (gradient_norm + 1e-6)).min(1.0);
         self.step += 1;
-        for (name, variable) in parameters.trainable() {
-            if let Some(gradient) = gradients.get(name) {
-                let gradient = (gradient.to_dtype(DType::F32)? * scale)?;
-                self.update(name, variable, &gradient, rate)?;
-            }
-        }
+        self.update(parameters, gradients, scale, rate)?;
         Ok(StepReport { rate, gradient_norm })
     }
 
-    /// Updates one parameter and its moments.
-    fn update(&mut self, name: &str, variable: &Var, gradient: &Tensor, rate: f64) -> Result<()> {
-        let AdamWConfig { beta1, beta2, epsilon, weight_decay, decay, .. } = self.config;
-        let moments = match self.moments.remove(name) {
-            Some(moments) => moments,
-            None => Moments { first: gradient.zeros_like()?, second: gradient.zeros_like()? },
-        };
-        let first = ((moments.first * beta1)? + (gradient * (1.0 - beta1))?)?;
-        let second = ((moments.second * beta2)? + (gradient.sqr()? * (1.0 - beta2))?)?;
+    /// Updates every parameter that has a gradient, and its moments.
+    fn update(
+        &mut self,
+        parameters: &Parameters,
+        gradients: &Gradients,
+        scale: f64,
+        rate: f64,
+    ) -> Result<()> {
+        let mut updated = Vec::with_capacity(gradients.0.len());
+        for (name, variable) in parameters.trainable() {
+            if let Some(gradient) = gradients.get(name) {
+                if !self.moments.contains_key(name) {
+                    self.moments.insert(name.to_owned(), Moments::zeros(variable)?);
+                }
+                updated.push((name, variable, gradient.contiguous()?));
+            }
+        }
+        let step = self.corrections(scale, rate);
+        let decayed = 1.0 - rate * self.config.weight_decay;
+        let mut moments: BTreeMap<&str, &mut Moments> =
+            self.moments.iter_mut().map(|(name, moments)| (name.as_str(), moments)).collect();
+        let mut jobs = Vec::with_capacity(updated.len());
+        for (name, variable, gradient) in &updated {
+            let kept = if self.config.decay.applies(name, variable.rank()) { decayed } else { 1.0 };
+            match moments.remove(name) {
+                Some(Moments::Host { first, second, .. }) => {
+                    let (parameter, kept) = (variable.as_tensor(), kept as f32);
+                    jobs.push(AdamWJob { parameter, gradient, first, second, kept });
+                }
+                Some(Moments::Device { first, second }) => {
+                    composed_update(&step, kept, variable, gradient, (first, second))?;
+                }
+                None => {}
+            }
+        }
+        adamw(jobs, &step)
+    }
+
+    /// The numbers of this step that hold for all parameters.
+    fn corrections(&self, scale: f64, rate: f64) -> AdamWStep {
+        let AdamWConfig { beta1, beta2, epsilon, .. } = self.config;
         let step = self.step.min(i32::MAX as u64) as i32;
-        let step_size = rate / (1.0 - beta1.powi(step));
-        let denominator = ((second.sqrt()? / (1.0 - beta2.powi(step)).sqrt())? + epsilon)?;
-        let parameter = variable.as_detached_tensor();
-        let kept = match decay.applies(name, parameter.rank()) {
-            true => (parameter * (1.0 - rate * weight_decay))?,
-            false => parameter,
-        };
-        variable.set(&(kept - ((&first / denominator)? * step_size)?)?)?;
-        self.moments.insert(name.to_owned(), Moments { first, second });
-        Ok(())
+        AdamWStep {
+            beta1: beta1 as f32,
+            beta2: beta2 as f32,
+            epsilon: epsilon as f32,
+            scale: scale as f32,
+            size: (rate / (1.0 - beta1.powi(step))) as f32,
+            root: (1.0 / (1.0 - beta2.powi(step)).sqrt()) as f32,
+        }
     }
 
     /// Returns the moments under `first.NAME` and `second.NAME`; with [`AdamW::step_count`] they are the whole state.
     pub fn state(&self) -> BTreeMap<String, Tensor> {
         let tensors = self.moments.iter().flat_map(|(name, moments)| {
-            [
-                (format!("first.{name}"), moments.first.clone()),
-                (format!("second.{name}"), moments.second.clone()),
-            ]
+            let (first, second) = moments.tensors();
+            [(format!("first.{name}"), first), (format!("second.{name}"), second)]
         });
         tensors.collect()
     }
@@ -284,9 +384,7 @@ impl AdamW {
             if smallest < 0.0 {
                 return Err(OptimizerError::NegativeMoment { name: name.to_owned(), got: smallest });
             }
-            let device = variable.device();
-            let own = Moments { first: first.to_device(device)?, second: second.to_device(device)? };
-            moments.insert(name.to_owned(), own);
+            moments.insert(name.to_owned(), Moments::restore(variable, first, second)?);
         }
         Ok(AdamW { config, step, moments })
     }

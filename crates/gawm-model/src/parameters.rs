@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use candle_core::{DType, Device, Tensor, Var};
+use gawm_kernels::GradientSink;
 use thiserror::Error;
 
 use crate::random::Stream;
@@ -66,6 +67,7 @@ pub(crate) fn buffer(specs: &mut Specs, name: String, shape: &[usize], init: Ini
 pub struct Parameters {
     specs: Specs,
     variables: BTreeMap<String, Var>,
+    sink: GradientSink,
 }
 
 /// Why a tensor cannot be taken as a parameter.
@@ -136,7 +138,7 @@ impl Parameters {
             let tensor = tensor.to_dtype(spec.dtype)?.to_device(device)?;
             variables.insert(name.clone(), Var::from_tensor(&tensor)?);
         }
-        Ok(Parameters { specs: specs.clone(), variables })
+        Ok(Parameters { specs: specs.clone(), variables, sink: GradientSink::default() })
     }
 
     /// Names, shapes and starts, sorted by name.
@@ -156,6 +158,11 @@ impl Parameters {
     /// Returns the variable of `name`.
     pub(crate) fn variable(&self, name: &str) -> candle_core::Result<&Var> {
         self.variables.get(name).ok_or_else(|| candle_core::Error::CannotFindTensor { path: name.to_owned() })
+    }
+
+    /// Where fused operations put the gradients of these tensors; [`Gradients::of`](crate::Gradients::of) reads it.
+    pub(crate) fn sink(&self) -> &GradientSink {
+        &self.sink
     }
 
     /// Returns names and tensors, sorted by name; running statistics included.

@@ -42,9 +42,9 @@ struct Block {
 }
 
 /// Epsilon of the norms with scale and shift.
-const AFFINE_EPSILON: f64 = 1e-5;
+pub(crate) const AFFINE_EPSILON: f64 = 1e-5;
 /// Epsilon of the norms without.
-const PLAIN_EPSILON: f64 = 1e-6;
+pub(crate) const PLAIN_EPSILON: f64 = 1e-6;
 
 impl Predictor {
     /// Adds the tensors under `predictor`.

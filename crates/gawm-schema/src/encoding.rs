@@ -87,7 +87,7 @@ impl Encoding {
     /// Returns the encoding of a kind in states.
     pub fn of_state(kind: Kind) -> Encoding {
         match kind {
-            Kind::Linear | Kind::Gripper | Kind::Bool => Encoding::Identity,
+            Kind::Linear | Kind::Gripper | Kind::Bool | Kind::Direction => Encoding::Identity,
             Kind::Angle { .. } => Encoding::SinCos,
             Kind::Quaternion { .. } | Kind::Rotvec | Kind::Euler { .. } | Kind::Matrix => {
                 Encoding::Rotation6d
@@ -98,7 +98,9 @@ impl Encoding {
     /// Returns the encoding of a kind in actions.
     pub fn of_action(kind: Kind) -> Encoding {
         match kind {
-            Kind::Linear | Kind::Gripper | Kind::Bool | Kind::Angle { .. } => Encoding::Identity,
+            Kind::Linear | Kind::Gripper | Kind::Bool | Kind::Direction | Kind::Angle { .. } => {
+                Encoding::Identity
+            }
             Kind::Quaternion { .. } | Kind::Rotvec | Kind::Euler { .. } | Kind::Matrix => {
                 Encoding::RotationVector
             }
@@ -220,7 +222,7 @@ impl Encoder {
                         Encoding::SinCos | Encoding::Rotation6d => Unit("1".to_owned()),
                     },
                     encoding,
-                    is_standardised: part.kind != Kind::Bool
+                    is_standardised: !matches!(part.kind, Kind::Bool | Kind::Direction)
                         && matches!(encoding, Encoding::Identity | Encoding::RotationVector),
                     feature: feature.name.clone(),
                     raw_dims: element.iter().map(|dim| dim.name.clone()).collect(),
@@ -324,7 +326,7 @@ impl EncodedPart {
                 }
                 rotation::matrix_from_six(rotation::six_from_matrix(&matrix)).ok_or_else(refused)
             }
-            Kind::Linear | Kind::Gripper | Kind::Bool | Kind::Angle { .. } => {
+            Kind::Linear | Kind::Gripper | Kind::Bool | Kind::Direction | Kind::Angle { .. } => {
                 unreachable!("kinds of width 1 are never encoded as rotations")
             }
         }

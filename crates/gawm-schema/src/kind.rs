@@ -32,6 +32,8 @@ pub enum Kind {
     Gripper,
     /// Truth values stored as 0 and 1; kept as they are and never standardised.
     Bool,
+    /// Components of a unit vector as recorded, such as cosine and sine of a yaw; kept as they are and never standardised.
+    Direction,
 }
 
 /// The interval that recorded angles are wrapped to.
@@ -83,7 +85,7 @@ impl Kind {
     /// Returns how many dims one element of this kind has in the raw data (1, 3, 4 or 9).
     pub fn raw_width(self) -> usize {
         match self {
-            Kind::Linear | Kind::Angle { .. } | Kind::Gripper | Kind::Bool => 1,
+            Kind::Linear | Kind::Angle { .. } | Kind::Gripper | Kind::Bool | Kind::Direction => 1,
             Kind::Rotvec | Kind::Euler { .. } => 3,
             Kind::Quaternion { .. } => 4,
             Kind::Matrix => 9,

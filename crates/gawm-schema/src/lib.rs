@@ -7,6 +7,7 @@
 //! **Invariant**: this crate knows neither files nor tensors.
 #![forbid(unsafe_code)]
 
+pub mod batch;
 mod encoding;
 mod feature;
 mod hash;

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use gawm_sim::collect::{
     ACTION_TOPIC, CollectError, CollectOptions, EPISODE_METADATA, Episode, FIRST_ROW_NS, GOAL_TOPIC,
-    IMAGE_TOPIC, ImageFormat, MARKER_TOPIC, SESSION_METADATA, STATE_TOPIC, collect,
+    IMAGE_TOPIC, ImageFormat, MARKER_TOPIC, SESSION_METADATA, STATE_TOPIC, collect, collect_until,
 };
 use gawm_sim::{Frame, TwoRoom};
 use serde_json::Value;
@@ -216,11 +216,12 @@ fn jpeg_and_size_are_obeyed() {
     let topics = messages(&collected(&jpeg));
     let (format, bytes) = image(&topics[IMAGE_TOPIC][0]);
     assert_eq!((format, &bytes[..3]), ("jpeg", &[0xff, 0xd8, 0xff][..]));
-    let decoded = turbojpeg::decompress(bytes, turbojpeg::PixelFormat::RGB).unwrap();
-    assert_eq!((decoded.width, decoded.height), (64, 64));
-    let furthest = decoded.pixels.iter().zip(&rgb).map(|(a, b)| a.abs_diff(*b)).max();
-    let mean: f64 = decoded.pixels.iter().zip(&rgb).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>()
-        / rgb.len() as f64;
+    let decoded = gawm_image::decode(bytes, &gawm_image::Limits::default()).unwrap();
+    assert_eq!((decoded.width(), decoded.height()), (64, 64));
+    let gawm_image::Pixels::Rgb8(decoded) = decoded.into_pixels() else { panic!("not RGB") };
+    let furthest = decoded.iter().zip(&rgb).map(|(a, b)| a.abs_diff(*b)).max();
+    let mean: f64 =
+        decoded.iter().zip(&rgb).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>() / rgb.len() as f64;
     assert!(mean < 4.0, "mean difference {mean}, largest {furthest:?}");
 }
 
@@ -246,4 +247,17 @@ fn unusable_requests_are_refused() {
     std::fs::write(dir.path().join("b.txt"), "mine").unwrap();
     check_refused(dir.path(), &base, "found \"b.txt\"");
     check_refused(&dir.path().join("b.txt"), &base, "failed to create folder");
+}
+
+#[test]
+fn an_interrupt_leaves_whole_logs_only() {
+    let dir = tempfile::tempdir().unwrap();
+    let interrupt = std::sync::atomic::AtomicBool::new(false);
+    let stop = |_: u64| interrupt.store(true, std::sync::atomic::Ordering::Relaxed);
+    let options = CollectOptions { jobs: 1, ..options() };
+    let error = collect_until(dir.path(), &options, &stop, &interrupt).unwrap_err();
+    assert!(matches!(error, CollectError::Interrupted), "{error}");
+    let names: Vec<_> =
+        std::fs::read_dir(dir.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert_eq!(names, ["two-room-000000.mcap"], "the log that was done");
 }

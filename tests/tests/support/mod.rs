@@ -221,6 +221,16 @@ impl Dataset {
         (0..episodes.len()).map(|row| episodes.get(row + 1) != Some(&episodes[row])).collect()
     }
 
+    /// The task of an episode.
+    pub fn task_of(&self, episode: i64) -> String {
+        let row = self.integers("episode_index").iter().position(|index| *index == episode).unwrap();
+        let task = self.integers("task_index")[row];
+        let file = std::fs::File::open(self.dir.join("meta/tasks.parquet")).unwrap();
+        let mut reader = ParquetRecordBatchReaderBuilder::try_new(file).unwrap().build().unwrap();
+        let batch = reader.next().unwrap().unwrap();
+        batch["task"].as_string::<i32>().value(usize::try_from(task).unwrap()).to_owned()
+    }
+
     /// A column of meta/episodes as text.
     pub fn episode_column(&self, column: &str) -> Vec<String> {
         let file = std::fs::File::open(self.dir.join("meta/episodes/chunk-000/file-000.parquet")).unwrap();

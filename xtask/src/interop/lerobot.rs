@@ -34,8 +34,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
             python::environment(&folder.join("venv"), &requirements, &[])?
         }
     };
-    let datasets =
+    let mut datasets =
         if arguments.datasets.is_empty() { ingest_fixtures(&folder)? } else { arguments.datasets.clone() };
+    let edited: Vec<Vec<PathBuf>> =
+        datasets.iter().map(|dataset| edit(&folder, dataset)).collect::<anyhow::Result<_>>()?;
+    datasets.extend(edited.into_iter().flatten());
     let mut text = String::from("Command: `cargo xtask interop lerobot`.\n");
     let mut is_good = true;
     for dataset in &datasets {
@@ -56,6 +59,66 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         record("lerobot", &text)?;
     }
     Ok(ExitCode::from(u8::from(!is_good)))
+}
+
+/// Runs every verb of `gawm-data` that writes datasets and returns what they wrote: half of the dataset twice, the whole
+/// merged again, a filtered and a trimmed one.
+fn edit(folder: &Path, dataset: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let name = dataset.file_name().context("a dataset has no name")?.to_string_lossy().into_owned();
+    let out = folder.join(format!("{name}-edited"));
+    if out.exists() {
+        std::fs::remove_dir_all(&out).with_context(|| format!("cannot remove {}", out.display()))?;
+    }
+    let path = |name: &str| out.join(name);
+    let text = |path: &Path| path.display().to_string();
+    let (source, parts) = (text(dataset), path("parts"));
+    let mut written = vec![path("filtered"), path("trimmed")];
+    gawm_data(&[
+        "filter",
+        &source,
+        "--out",
+        &text(&written[0]),
+        "--where",
+        "length > 1 and episode_index < 1000",
+    ])?;
+    gawm_data(&["trim", &source, "--out", &text(&written[1])])?;
+    let n_episodes = episodes(dataset)?;
+    if n_episodes > 1 {
+        let first = format!("first=0:{}", n_episodes / 2);
+        let rest = format!("rest={}:{n_episodes}", n_episodes / 2);
+        let by = ["--by", "episode", "--into", &first, "--into", &rest];
+        gawm_data(&[&["split", &source, "--out", &text(&parts)], &by[..]].concat())?;
+        let merged = path("merged");
+        gawm_data(&[
+            "merge",
+            &text(&parts.join("first")),
+            &text(&parts.join("rest")),
+            "--out",
+            &text(&merged),
+        ])?;
+        written.extend([parts.join("rest"), merged]);
+    }
+    Ok(written)
+}
+
+fn episodes(dataset: &Path) -> anyhow::Result<u64> {
+    let path = dataset.join("meta/info.json");
+    let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
+    let info: serde_json::Value = serde_json::from_str(&text)?;
+    info["total_episodes"].as_u64().context("info.json has no total_episodes")
+}
+
+fn gawm_data(arguments: &[&str]) -> anyhow::Result<()> {
+    let cargo = std::env::var("CARGO").unwrap_or_else(|_| "cargo".to_owned());
+    let status = Command::new(&cargo)
+        .args(["run", "--release", "--quiet", "-p", "gawm-dataset", "--bin", "gawm-data", "--"])
+        .args(arguments)
+        .current_dir(root())
+        .status()
+        .with_context(|| format!("cannot run {cargo}"))?;
+    // 3: something damaged was left out, as the program says itself.
+    ensure!(matches!(status.code(), Some(0 | 3)), "gawm-data {} failed ({status})", arguments.join(" "));
+    Ok(())
 }
 
 /// Ingests the fixtures, and an arm's log where the corpora are there, with the real program; returns the datasets.

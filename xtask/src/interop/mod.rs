@@ -2,6 +2,7 @@
 
 mod lerobot;
 mod python;
+mod tensorboard;
 mod torch;
 
 use std::io::Write;
@@ -23,6 +24,8 @@ pub(crate) struct Arguments {
 enum With {
     /// Open our datasets with the published `lerobot`.
     Lerobot(lerobot::Arguments),
+    /// Read the event files of a run with the real `tensorboard`.
+    Tensorboard(tensorboard::Arguments),
     /// Exchange weights with the published PyTorch modules, both ways.
     Torch(torch::Arguments),
 }
@@ -30,6 +33,7 @@ enum With {
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
     match &arguments.with {
         With::Lerobot(arguments) => lerobot::run(arguments),
+        With::Tensorboard(arguments) => tensorboard::run(arguments),
         With::Torch(arguments) => torch::run(arguments),
     }
 }

@@ -4,7 +4,9 @@ use std::{fmt::Write, path::PathBuf};
 
 use clap::{Args, ValueEnum};
 
+use super::progress::watch;
 use super::{Failure, open, print_result};
+use crate::read::Dataset;
 use crate::stats::{Difference, dataset_stats, difference};
 
 /// Compare two datasets: features, counts, and the distribution of each dim
@@ -25,9 +27,13 @@ enum Format {
     Json,
 }
 
-pub(super) fn run(arguments: &DiffArguments) -> Result<u8, Failure> {
+pub(super) fn run(arguments: &DiffArguments, quiet: bool) -> Result<u8, Failure> {
     let (first, second) = (open(&arguments.first)?, open(&arguments.second)?);
-    let found = difference(&dataset_stats(&first)?, &dataset_stats(&second)?);
+    let measured = |dataset: &Dataset| {
+        let _watch = watch(quiet, "measuring", &dataset.rows_read);
+        dataset_stats(dataset)
+    };
+    let found = difference(&measured(&first)?, &measured(&second)?);
     let text = match arguments.format {
         Format::Text => table(&found),
         Format::Json => serde_json::to_string_pretty(&found)? + "\n",

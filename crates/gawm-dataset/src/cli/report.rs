@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 
+use super::progress::watch;
 use super::{Failure, open};
 use crate::report::{ReportOptions, render_report};
 
@@ -21,11 +22,15 @@ pub(super) struct ReportArguments {
     share: bool,
 }
 
-pub(super) fn run(arguments: &ReportArguments) -> Result<u8, Failure> {
+pub(super) fn run(arguments: &ReportArguments, quiet: bool) -> Result<u8, Failure> {
     let dataset = open(&arguments.dir)?;
+    let watch = watch(quiet, "examining", &dataset.rows_read);
     let page = render_report(&dataset, ReportOptions { is_shared: arguments.share })?;
+    drop(watch);
     super::write_replacing(&arguments.out, page.as_bytes())
         .with_context(|| format!("cannot write {}", arguments.out.display()))?;
-    eprintln!("wrote {} ({} kB)", arguments.out.display(), page.len() / 1024);
+    if !quiet {
+        eprintln!("wrote {} ({} kB)", arguments.out.display(), page.len() / 1024);
+    }
     Ok(0)
 }

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::{Args, ValueEnum};
 
+use super::progress::watch;
 use super::{EXIT_CHECK_FAILED, Failure, open, print_result};
 use crate::stats::{camera_summaries, dataset_stats, lerobot_stats, render_text, to_json};
 
@@ -27,11 +28,13 @@ enum Format {
     Json,
 }
 
-pub(super) fn run(arguments: &StatsArguments) -> Result<u8, Failure> {
+pub(super) fn run(arguments: &StatsArguments, quiet: bool) -> Result<u8, Failure> {
     let dataset = open(&arguments.dir)?;
+    let watch = watch(quiet, "measuring", &dataset.rows_read);
     let stats = dataset_stats(&dataset)?;
     let needs_cameras = arguments.write || arguments.format == Format::Json;
     let cameras = if needs_cameras { camera_summaries(&dataset) } else { Default::default() };
+    drop(watch);
     let text = match arguments.format {
         Format::Text => render_text(&stats),
         Format::Json => serde_json::to_string_pretty(&to_json(&stats, &cameras))? + "\n",

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::{Args, ValueEnum};
 
+use super::progress::watch;
 use super::{EXIT_CHECK_FAILED, Failure, open, print_result};
 use crate::validate::{
     DemoReport, Severity, Thresholds, ValidateOptions, render_markdown, render_text, run_demo, validate,
@@ -82,16 +83,16 @@ pub(super) fn run(arguments: &ValidateArguments, quiet: bool) -> Result<u8, Fail
         return Err(Failure::usage(anyhow::anyhow!("expected a dataset folder, got none")));
     };
     let dataset = open(dir)?;
-    if !quiet && dataset.n_rows() > 2_000_000 {
-        eprintln!("reading {} rows of {} episodes", dataset.n_rows(), dataset.runs.len());
-    }
+    let watch = watch(quiet, "checking", &dataset.rows_read);
     let options = ValidateOptions {
         thresholds,
         window_rows: arguments.window.max(1),
         checks_images: !arguments.no_images,
         probes_targets: arguments.probe,
+        ..ValidateOptions::default()
     };
     let report = validate(&dataset, &options)?;
+    drop(watch);
     let text = match arguments.format {
         Format::Text => render_text(&report),
         Format::Md => render_markdown(&report),

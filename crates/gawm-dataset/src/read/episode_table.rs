@@ -9,6 +9,8 @@ use arrow::{
 use parquet::arrow::{ProjectionMask, arrow_reader::ParquetRecordBatchReaderBuilder};
 use serde_json::Value;
 
+use crate::episode::FeatureStats;
+
 use super::{Column, DataFile, Defect, DefectKind, Info, ReadLimits, Run, files, info, paths};
 
 /// Most defects of one kind that are listed one by one.
@@ -212,11 +214,8 @@ fn episode_lines(root: &Path, info: &Info, limits: &ReadLimits) -> Result<Vec<Ep
     Ok(entries)
 }
 
-fn episode_rows(
-    root: &Path,
-    limits: &ReadLimits,
-    defects: &mut Vec<Defect>,
-) -> Result<Vec<EpisodeEntry>, String> {
+/// Lists the Parquet files of the episode table.
+fn table_files(root: &Path) -> Vec<String> {
     let folder = root.join("meta/episodes");
     let mut names = Vec::new();
     let list = |path: &Path| std::fs::read_dir(path).into_iter().flatten().flatten().collect::<Vec<_>>();
@@ -233,6 +232,15 @@ fn episode_rows(
         }
     }
     names.sort();
+    names
+}
+
+fn episode_rows(
+    root: &Path,
+    limits: &ReadLimits,
+    defects: &mut Vec<Defect>,
+) -> Result<Vec<EpisodeEntry>, String> {
+    let names = table_files(root);
     if names.is_empty() {
         return Err("no Parquet file in meta/episodes".to_owned());
     }
@@ -255,6 +263,44 @@ fn episode_rows(
         }
     }
     Ok(entries)
+}
+
+/// Returns what the folder says of the pixels of some cameras in single episodes; what cannot be read is not there.
+pub(crate) fn episode_statistics(
+    dataset: &super::Dataset,
+    cameras: &[String],
+) -> BTreeMap<(i64, String), FeatureStats> {
+    let mut found = BTreeMap::new();
+    if dataset.info.version.is_v2() {
+        let text = info::read_text(&dataset.root, "meta/episodes_stats.jsonl", &dataset.limits);
+        for line in text.unwrap_or_default().lines().filter(|line| !line.trim().is_empty()) {
+            let Ok(value) = serde_json::from_str::<Value>(line) else { continue };
+            let Some(index) = value.get("episode_index").and_then(Value::as_i64) else { continue };
+            for camera in cameras {
+                let stats = value.get("stats").and_then(|s| s.get(camera)).and_then(FeatureStats::from_json);
+                found.extend(stats.map(|stats| ((index, camera.clone()), stats)));
+            }
+        }
+        return found;
+    }
+    let is_wanted = |column: &str| {
+        let feature = column.strip_prefix("stats/").and_then(|name| name.rsplit_once('/'));
+        column == "episode_index" || feature.is_some_and(|(name, _)| cameras.iter().any(|c| c == name))
+    };
+    for name in table_files(&dataset.root) {
+        let table = paths::join_inside(&dataset.root, &name).and_then(|path| read_table(&path, is_wanted));
+        for batch in table.map(|(batches, _)| batches).unwrap_or_default() {
+            let index = ints(&batch, "episode_index").unwrap_or_default();
+            for (row, camera) in (0..index.len()).flat_map(|row| cameras.iter().map(move |c| (row, c))) {
+                let of = |name: &str| batch.column_by_name(&format!("stats/{camera}/{name}"));
+                let names = ["min", "max", "mean", "std", "q01", "q10", "q50", "q90", "q99", "count"];
+                let value = names.iter().filter_map(|n| Some(((*n).to_owned(), json_value(of(n)?, row, 0))));
+                let stats = FeatureStats::from_json(&Value::Object(value.collect()));
+                found.extend(stats.map(|stats| ((index[row], camera.clone()), stats)));
+            }
+        }
+    }
+    found
 }
 
 fn entries_of(batch: &RecordBatch) -> Result<Vec<EpisodeEntry>, String> {

@@ -56,13 +56,13 @@ pub struct Run {
 const MAX_CHUNK_BYTES: i64 = 8 << 30;
 
 /// Runs `read`, turning errors and panics of the Parquet reader into text.
-pub(super) fn guarded<T>(read: impl FnOnce() -> Result<T, String>) -> Result<T, String> {
+pub(crate) fn guarded<T>(read: impl FnOnce() -> Result<T, String>) -> Result<T, String> {
     catch_unwind(AssertUnwindSafe(read))
         .unwrap_or_else(|_| Err("content that the Parquet reader cannot digest".to_owned()))
 }
 
 /// Opens a Parquet file and checks its footer against the file's size.
-pub(super) fn open_parquet(path: &Path) -> Result<(File, ArrowReaderMetadata), String> {
+pub(crate) fn open_parquet(path: &Path) -> Result<(File, ArrowReaderMetadata), String> {
     let file = File::open(path).map_err(|e| e.to_string())?;
     let size = file.metadata().map_err(|e| e.to_string())?;
     if !size.is_file() {

@@ -170,7 +170,7 @@ pub(super) fn read_text(root: &Path, relative: &str, limits: &ReadLimits) -> io:
 }
 
 /// Reads an optional JSON file; a broken one is a defect.
-pub(super) fn read_json(
+pub(crate) fn read_json(
     root: &Path,
     relative: &str,
     limits: &ReadLimits,

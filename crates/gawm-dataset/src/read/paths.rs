@@ -54,7 +54,7 @@ pub(super) fn fill(template: &str, values: TemplateValues<'_>) -> Result<String,
 ///
 /// Symbolic links are followed only inside the folder, or into the `blobs` folder of a Hugging Face cache that the folder
 /// belongs to. A path that does not exist is joined unchanged.
-pub(super) fn join_inside(root: &Path, relative: &str) -> Result<PathBuf, String> {
+pub(crate) fn join_inside(root: &Path, relative: &str) -> Result<PathBuf, String> {
     let path = Path::new(relative);
     if path.components().any(|c| !matches!(c, Component::Normal(_) | Component::CurDir)) {
         return Err(format!("{relative:?}, which leaves the folder"));

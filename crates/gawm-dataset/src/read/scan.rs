@@ -86,13 +86,27 @@ impl Dataset {
         columns: &[String],
         process: impl Fn(EpisodeRows) -> R + Sync,
     ) -> Result<(Vec<R>, Vec<Defect>), ScanError> {
+        self.scan_some(columns, |_| true, process)
+    }
+
+    /// [`Dataset::scan`] of the runs that are wanted, by their position; files without any are not read.
+    ///
+    /// # Errors
+    /// A run has more rows than are held at once.
+    pub fn scan_some<R: Send>(
+        &self,
+        columns: &[String],
+        is_wanted: impl Fn(usize) -> bool + Sync,
+        process: impl Fn(EpisodeRows) -> R + Sync,
+    ) -> Result<(Vec<R>, Vec<Defect>), ScanError> {
         for run in &self.runs {
             if run.n_rows > self.limits.max_unit_rows as u64 {
                 let (episode, got) = (run.episode_index, run.n_rows);
                 return Err(ScanError::EpisodeTooLong { episode, max: self.limits.max_unit_rows, got });
             }
         }
-        let units = self.units(UNIT_ROWS);
+        let mut units = self.units(UNIT_ROWS);
+        units.retain(|unit| unit.runs.clone().any(&is_wanted));
         let results: Mutex<Vec<(usize, R)>> = Mutex::new(Vec::with_capacity(self.runs.len()));
         let defects: Mutex<Vec<(usize, Defect)>> = Mutex::new(Vec::new());
         let n_threads = rayon::current_num_threads();
@@ -104,10 +118,15 @@ impl Dataset {
         rayon::scope(|scope| {
             for (unit_index, unit) in units.iter().enumerate() {
                 let (process, keep, n_in_flight, defects) = (&process, &keep, &n_in_flight, &defects);
+                let is_wanted = &is_wanted;
                 scope.spawn(move |scope| {
                     let outcome = files::guarded(|| {
                         self.read_unit(unit, columns, |rows| {
                             let index = rows.run_index;
+                            self.rows_read.fetch_add(rows.run.n_rows, Ordering::Relaxed);
+                            if !is_wanted(index) {
+                                return;
+                            }
                             if !is_spawning || n_in_flight.load(Ordering::Relaxed) > 2 * n_threads {
                                 keep(index, process(rows));
                                 return;

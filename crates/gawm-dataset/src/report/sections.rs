@@ -3,10 +3,10 @@
 use std::{collections::BTreeMap, fmt::Write};
 
 use base64::Engine;
+use gawm_image::{Limits, decode_thumbnail, encode_jpeg};
 
 use super::{Material, chart, escape};
 use crate::{
-    picture,
     read::FrameBytes,
     validate::{Finding, Severity, rule},
 };
@@ -48,7 +48,8 @@ pub(super) fn overview(material: &Material<'_>, page: &mut String) {
         facts.push((robot.clone(), "robot"));
     }
     if let Some(lag) = material.examination.action_lag {
-        facts.push((format!("{} rows", lag.rows), "from action to motion"));
+        let unit = if lag.rows.abs() == 1 { "row" } else { "rows" };
+        facts.push((format!("{} {unit}", lag.rows), "from action to motion"));
     }
     page.push_str("<ul class=\"facts\">");
     for (value, name) in facts {
@@ -272,13 +273,17 @@ pub(super) fn dims(material: &Material<'_>, page: &mut String) {
         for dim in column.dims.iter().take(SHOWN_DIMS) {
             let s = dim.values.summary();
             let motion = dim.motion.summary(material.stats.fps);
-            let unit = if dim.unit.is_empty() { String::new() } else { format!(" [{}]", dim.unit) };
+            // "1" says that there is no unit.
+            let has_unit = !dim.unit.is_empty() && dim.unit != "1";
+            let unit = if has_unit { format!(" [{}]", dim.unit) } else { String::new() };
             let missing = if s.n_missing > 0 { format!(", {} missing", s.n_missing) } else { String::new() };
             let name = if dim.name.is_empty() { column.name.clone() } else { dim.name.clone() };
             write!(
                 page,
                 "<div class=\"dim\"><b>{}</b>{}<small>mean {:.4}, std {:.4}, {:.4} to {:.4}{missing}; speed {:.3}/s, idle {:.0} %</small>{}{}</div>",
-                escape(&name), escape(&unit), s.mean, s.std, s.min, s.max, motion.mean_speed, 100.0 * motion.idle_share,
+                escape(&name),
+                escape(&unit),
+                s.mean, s.std, s.min, s.max, motion.mean_speed, 100.0 * motion.idle_share,
                 chart::histogram(dim.values.histogram.counts(), &format!("histogram of {name}")),
                 chart::trace(&dim.trace, &format!("{name} in the first episode"), None)
             )
@@ -414,12 +419,12 @@ fn skew(material: &Material<'_>, page: &mut String) {
 /// Returns a frame as a small picture inside the page.
 fn embedded(frame: &FrameBytes) -> Option<String> {
     let FrameBytes::Encoded(bytes) = frame else { return None };
-    let (_, picture) = picture::decode(bytes, FRAME_WIDTH / 2).ok()?;
+    let (_, picture) = decode_thumbnail(bytes, FRAME_WIDTH / 2, &Limits::default()).ok()?;
     let small = if picture.width > FRAME_WIDTH {
         picture.shrunk(FRAME_WIDTH, (picture.height * FRAME_WIDTH / picture.width).max(1))
     } else {
         picture
     };
-    let jpeg = small.to_jpeg().ok()?;
+    let jpeg = encode_jpeg(&small.to_image().ok()?, 75).ok()?;
     Some(format!("data:image/jpeg;base64,{}", base64::engine::general_purpose::STANDARD.encode(jpeg)))
 }

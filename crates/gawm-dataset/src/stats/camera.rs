@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 
+use gawm_image::{Limits, decode_thumbnail};
 use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::{
-    picture,
+    episode::FeatureStats,
     read::{Dataset, FrameBytes},
 };
 
@@ -22,59 +23,91 @@ pub struct CameraSummary {
     pub channels: Vec<[f64; 9]>,
 }
 
-/// Looks at up to 256 frames of each camera in the data files, evenly spread.
+/// Counts of pixel levels per channel over some frames of one run.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct CameraCounts {
+    frames: u64,
+    channels: [[u64; 256]; 3],
+}
+
+impl CameraCounts {
+    const EMPTY: CameraCounts = CameraCounts { frames: 0, channels: [[0; 256]; 3] };
+
+    fn merge(&mut self, other: &CameraCounts) {
+        self.frames += other.frames;
+        for (own, other) in self.channels.iter_mut().zip(&other.channels) {
+            own.iter_mut().zip(other).for_each(|(a, b)| *a += b);
+        }
+    }
+
+    fn summary(&self) -> CameraSummary {
+        CameraSummary { frames: self.frames, channels: self.channels.iter().map(channel).collect() }
+    }
+
+    /// Returns LeRobot's statistics of the run.
+    pub(crate) fn feature_stats(&self) -> FeatureStats {
+        let channels = self.summary().channels;
+        let values = |k: usize| channels.iter().map(|c| c[k]).collect();
+        FeatureStats {
+            min: values(0),
+            max: values(1),
+            mean: values(2),
+            std: values(3),
+            q01: values(4),
+            q10: values(5),
+            q50: values(6),
+            q90: values(7),
+            q99: values(8),
+            count: self.frames,
+        }
+    }
+}
+
+/// Looks at up to 256 frames of each camera in the data files, evenly spread, and at least one of each run.
 pub fn camera_summaries(dataset: &Dataset) -> BTreeMap<String, CameraSummary> {
-    let cameras = dataset.image_columns();
-    let n_rows = dataset.n_rows().max(1);
-    let stride = n_rows.div_ceil(SAMPLED_FRAMES as u64).max(1);
+    camera_counts(dataset).0
+}
+
+/// [`camera_summaries`], and the counts of each run.
+pub(crate) fn camera_counts(
+    dataset: &Dataset,
+) -> (BTreeMap<String, CameraSummary>, BTreeMap<String, Vec<CameraCounts>>) {
+    let stride = dataset.n_rows().div_ceil(SAMPLED_FRAMES as u64).max(1);
     let wanted = |run: &crate::read::Run| -> Vec<usize> {
-        (0..run.n_rows)
-            .filter(|r| (run.global_start + r).is_multiple_of(stride))
-            .map(|r| r as usize)
-            .collect()
+        let first = run.global_start.next_multiple_of(stride) - run.global_start;
+        let rows: Vec<usize> = (first..run.n_rows).step_by(stride as usize).map(|row| row as usize).collect();
+        if rows.is_empty() && run.n_rows > 0 { vec![run.n_rows as usize / 2] } else { rows }
     };
-    let summarise = |camera: &String| {
-        let counts: Vec<([[u64; 256]; 3], u64)> = dataset
-            .runs
-            .par_iter()
-            .enumerate()
-            .map(|(index, run)| {
-                let rows = wanted(run);
-                let mut counts = ([[0; 256]; 3], 0);
-                let frames = if rows.is_empty() {
-                    Vec::new()
-                } else {
-                    dataset.read_frames(index, camera, &rows).unwrap_or_default()
-                };
-                for frame in frames {
-                    let FrameBytes::Encoded(bytes) = frame else { continue };
-                    let Ok((_, picture)) = picture::decode(&bytes, 64) else { continue };
-                    picture
-                        .rgb
-                        .chunks_exact(3)
-                        .for_each(|p| (0..3).for_each(|c| counts.0[c][usize::from(p[c])] += 1));
-                    counts.1 += 1;
-                }
-                counts
+    let (mut summaries, mut all_runs) = (BTreeMap::new(), BTreeMap::new());
+    for camera in dataset.image_columns() {
+        let runs: Vec<CameraCounts> = (0..dataset.runs.len())
+            .into_par_iter()
+            .map(|index| {
+                let frames = dataset.read_frames(index, &camera, &wanted(&dataset.runs[index]));
+                counts_of(&frames.unwrap_or_default())
             })
             .collect();
-        let mut total = ([[0u64; 256]; 3], 0);
-        for (channels, frames) in counts {
-            total
-                .0
-                .iter_mut()
-                .zip(&channels)
-                .for_each(|(t, c)| t.iter_mut().zip(c).for_each(|(a, b)| *a += b));
-            total.1 += frames;
+        let mut total = CameraCounts::EMPTY;
+        runs.iter().for_each(|run| total.merge(run));
+        if total.frames > 0 {
+            summaries.insert(camera.clone(), total.summary());
         }
-        (total.1 > 0).then(|| {
-            (
-                camera.clone(),
-                CameraSummary { frames: total.1, channels: total.0.iter().map(channel).collect() },
-            )
-        })
-    };
-    cameras.iter().filter_map(summarise).collect()
+        all_runs.insert(camera, runs);
+    }
+    (summaries, all_runs)
+}
+
+fn counts_of(frames: &[FrameBytes]) -> CameraCounts {
+    let mut counts = CameraCounts::EMPTY;
+    for frame in frames {
+        let FrameBytes::Encoded(bytes) = frame else { continue };
+        let Ok((_, picture)) = decode_thumbnail(bytes, 64, &Limits::default()) else { continue };
+        for pixel in picture.rgb.chunks_exact(3) {
+            (0..3).for_each(|c| counts.channels[c][usize::from(pixel[c])] += 1);
+        }
+        counts.frames += 1;
+    }
+    counts
 }
 
 fn channel(counts: &[u64; 256]) -> [f64; 9] {

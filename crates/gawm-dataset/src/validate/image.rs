@@ -2,21 +2,22 @@
 
 use std::collections::BTreeMap;
 
+use gawm_image::{ImageError, Limits, decode_thumbnail};
+
 use super::{
-    Finding, Severity, Thresholds,
+    Finding, Thresholds,
     profile::RunProfile,
     robust::{Pair, centre_and_scale, median, quantile},
     signal::Stretch,
 };
-use crate::{
-    picture::{self, PictureError},
-    read::{DType, Dataset, Defect, FrameBytes, FrameReader, Run},
-};
+use crate::read::{DType, Dataset, Defect, FrameBytes, FrameReader, Run};
 
 /// Side of the thumbnails that frames are compared by.
 pub(super) const THUMB_SIDE: usize = 8;
 /// Pixels of a thumbnail.
 pub(super) const THUMB: usize = THUMB_SIDE * THUMB_SIDE;
+/// Most pixels of a frame that is decoded.
+const LIMITS: Limits = Limits { max_pixels: 1 << 26 };
 /// Largest lag of pictures that is looked for, in rows.
 const MAX_LAG: usize = 12;
 
@@ -61,7 +62,7 @@ impl FrameReader for Measurer {
                 let mut short = [0; 8];
                 short.copy_from_slice(&blake3::hash(&bytes).as_bytes()[..8]);
                 measure.hash = u64::from_le_bytes(short);
-                match picture::decode(&bytes, 2 * THUMB_SIDE) {
+                match decode_thumbnail(&bytes, 2 * THUMB_SIDE, &LIMITS) {
                     Ok((header, picture)) => {
                         let luma = picture.luma();
                         let n = luma.len().max(1) as f64;
@@ -76,12 +77,18 @@ impl FrameReader for Measurer {
                             if got != (height, width, channels) {
                                 run.n_wrong_size += 1;
                                 if run.wrong_size.len() < 4 {
-                                    run.wrong_size.push((row, header.height, header.width, header.channels));
+                                    run.wrong_size.push((
+                                        row,
+                                        header.height,
+                                        header.width,
+                                        header.channels.into(),
+                                    ));
                                 }
                             }
                         }
                     }
-                    Err(PictureError::NotShown) => {}
+                    // Depth in floats is no picture.
+                    Err(ImageError::Unsuitable { .. }) => {}
                     Err(e) => run.note_undecodable(row, e.to_string()),
                 }
             }
@@ -462,26 +469,39 @@ fn exchanged(
     }
 }
 
+/// The episodes that a video file shows.
+#[derive(Default)]
+struct VideoUse {
+    episodes: Vec<i64>,
+    n_rows: u64,
+    /// Frames up to the end of the last episode in it.
+    n_needed: u64,
+    /// The first episode whose place in the file is of another length than its rows.
+    misfit: Option<(i64, f64, u64)>,
+}
+
 /// Compares video files with the rows they belong to; no picture is decoded.
 pub(super) fn judge_videos(dataset: &Dataset) -> Vec<Finding> {
     let mut findings = Vec::new();
+    let mut rows_of: BTreeMap<i64, u64> = BTreeMap::new();
+    dataset.runs.iter().for_each(|run| *rows_of.entry(run.episode_index).or_default() += run.n_rows);
     for feature in dataset.info.features.iter().filter(|f| f.dtype == DType::Video) {
-        let mut by_file: BTreeMap<String, (Vec<i64>, u64)> = BTreeMap::new();
+        let mut by_file: BTreeMap<String, VideoUse> = BTreeMap::new();
         for entry in &dataset.episodes {
-            let n_rows: u64 = dataset
-                .runs
-                .iter()
-                .filter(|r| r.episode_index == entry.episode_index)
-                .map(|r| r.n_rows)
-                .sum();
-            if n_rows == 0 {
-                continue;
-            }
+            let Some(&n_rows) = rows_of.get(&entry.episode_index) else { continue };
             match dataset.video_path(entry, &feature.name) {
                 Some(Ok(path)) => {
                     let file = by_file.entry(path).or_default();
-                    file.0.push(entry.episode_index);
-                    file.1 += n_rows;
+                    file.episodes.push(entry.episode_index);
+                    file.n_rows += n_rows;
+                    if let Some(span) = entry.videos.get(&feature.name) {
+                        let frames = |secs: f64| secs * dataset.info.fps;
+                        let length = frames(span.to_timestamp_secs - span.from_timestamp_secs);
+                        file.n_needed = file.n_needed.max(frames(span.to_timestamp_secs).round() as u64);
+                        if (length - n_rows as f64).abs() > 0.5 {
+                            file.misfit.get_or_insert((entry.episode_index, length, n_rows));
+                        }
+                    }
                 }
                 Some(Err(got)) => findings
                     .push(Finding::new("STRUCT-003", format!("video_path: {got}")).feature(&feature.name)),
@@ -500,8 +520,8 @@ pub(super) fn judge_videos(dataset: &Dataset) -> Vec<Finding> {
             );
             continue;
         }
-        for (path, (episodes, n_rows)) in &by_file {
-            judge_video(dataset, feature, path, episodes, *n_rows, &mut findings);
+        for (path, used) in &by_file {
+            judge_video(dataset, feature, path, used, &mut findings);
         }
     }
     findings
@@ -511,12 +531,13 @@ fn judge_video(
     dataset: &Dataset,
     feature: &crate::read::FeatureDecl,
     path: &str,
-    episodes: &[i64],
-    n_rows: u64,
+    used: &VideoUse,
     findings: &mut Vec<Finding>,
 ) {
     let finding = |code: &'static str, message: String| {
-        Finding::new(code, message).episode(episodes.first().copied().unwrap_or(0)).feature(&feature.name)
+        Finding::new(code, message)
+            .episode(used.episodes.first().copied().unwrap_or(0))
+            .feature(&feature.name)
     };
     let file = dataset.root.join(path);
     if !file.is_file() {
@@ -530,16 +551,20 @@ fn judge_video(
             return;
         }
     };
-    if track.n_frames != n_rows {
-        // A file that other episodes share may hold more than those that lie here.
-        let is_shared = !dataset.info.version.is_v2() && track.n_frames > n_rows;
+    let n_rows = used.n_rows;
+    // In v3 a file may hold frames that no episode shows: those of episodes that were filtered or trimmed away.
+    let is_v2 = dataset.info.version.is_v2();
+    if (is_v2 && track.n_frames != n_rows) || track.n_frames < used.n_needed.max(n_rows) {
         let message = format!(
-            "{path} has {} frames, its {} episodes have {n_rows} rows",
+            "{path} has {} frames, its {} episodes have {n_rows} rows and end at frame {}",
             track.n_frames,
-            episodes.len()
+            used.episodes.len(),
+            used.n_needed
         );
-        let found = finding("IMAGE-013", message).measured(track.n_frames as f64, n_rows as f64);
-        findings.push(if is_shared { found.at(Severity::Warning) } else { found });
+        findings.push(finding("IMAGE-013", message).measured(track.n_frames as f64, n_rows as f64));
+    } else if let Some((episode, length, n_rows)) = used.misfit {
+        let message = format!("{path}: episode {episode} is given {length:.1} frames and has {n_rows} rows");
+        findings.push(finding("IMAGE-013", message).episode(episode).measured(length, n_rows as f64));
     }
     if let Some((height, width, _)) = feature.image_size()
         && (track.height as usize, track.width as usize) != (height, width)

@@ -182,6 +182,9 @@ pub fn check(contract: &Contract, file: &str) -> Result<CheckedContract, Contrac
     if contract.version != 1 {
         return Err(checker.value("version", "1", &contract.version.to_string(), ""));
     }
+    if contract.task_schema.is_some() {
+        return Err(checker.value("task_schema", "a contract that is read from a file", "a text", ""));
+    }
     if contract.stream.is_empty() {
         let hint = "add [[stream]] tables, or let `gawm-ingest suggest LOG` write them";
         return Err(checker.value("stream", "at least one stream", "none", hint));
@@ -628,6 +631,7 @@ impl Checker<'_> {
             KindSpec::Matrix => Kind::Matrix,
             KindSpec::Gripper => Kind::Gripper,
             KindSpec::Bool => Kind::Bool,
+            KindSpec::Direction => Kind::Direction,
         })
     }
 }

@@ -24,6 +24,14 @@ pub enum ContractError {
         /// Place, what was expected, what was there.
         detail: String,
     },
+    /// The task schema that it names cannot be used.
+    #[error("task schema {schema:?}: {detail}")]
+    TaskSchema {
+        /// Its name or file.
+        schema: String,
+        /// Why.
+        detail: String,
+    },
     /// A value cannot be used.
     #[error("{file}: {key}: expected {expected}, got {got}")]
     Value {
@@ -51,6 +59,9 @@ impl ContractError {
                 "docs/contract.md lists every key; `run --print-config` shows the resolved contract"
                     .to_owned(),
             ),
+            ContractError::TaskSchema { .. } => {
+                Some("task_schema = { name = \"reacher\" } takes a built-in one, { file = ... } one of yours, relative to the contract".to_owned())
+            }
             ContractError::Value { hint, .. } => (!hint.is_empty()).then(|| hint.clone()),
         }
     }

@@ -12,7 +12,9 @@ use super::{Contract, ContractError};
 pub fn load(path: &Path, overrides: &[String]) -> Result<Contract, ContractError> {
     let text = std::fs::read_to_string(path)
         .map_err(|source| ContractError::Read { path: path.to_owned(), source })?;
-    parse(&text, &path.display().to_string(), overrides)
+    let mut contract = parse(&text, &path.display().to_string(), overrides)?;
+    super::task::expand(&mut contract, path.parent().unwrap_or(Path::new("")))?;
+    Ok(contract)
 }
 
 /// Reads a contract from text; `file` is only named in errors.

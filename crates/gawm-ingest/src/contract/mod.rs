@@ -8,6 +8,7 @@ mod error;
 mod load;
 mod pattern;
 mod spec;
+mod task;
 
 pub use check::{
     CheckedContract, CheckedStream, Clock, EpisodeRule, ImageRule, StreamData, TickRule, VectorRule, check,
@@ -21,3 +22,4 @@ pub use spec::{
     LabelSource, LabelsSpec, MarkerValue, MetadataLabel, NonFiniteRule, ReduceSpec, RoleSpec, SplitSpec,
     StreamSpec, TickMode, TicksSpec, TimeUnit, TopicLabel,
 };
+pub use task::{StateTarget, TargetName, TaskSchema, TaskSchemaSpec};

@@ -24,6 +24,12 @@ pub struct Contract {
     pub max_gap_s: f64,
     /// How numbers are stored: `float64` (lossless for what logs hold) or `float32`.
     pub float: gawm_schema::FloatType,
+    /// How episodes lie in HDF5 and npz files; found from their columns by default.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub layout: Option<crate::tabular::Layout>,
+    /// A task schema, whose streams come before those below.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub task_schema: Option<super::TaskSchemaSpec>,
     /// When rows are made.
     pub ticks: TicksSpec,
     /// What becomes of which topic, in the order of the columns.
@@ -47,6 +53,8 @@ impl Default for Contract {
             causal: Causal::Stamp,
             disorder_window_ms: 1000.0,
             max_gap_s: 5.0,
+            layout: None,
+            task_schema: None,
             ticks: TicksSpec::default(),
             stream: Vec::new(),
             episodes: EpisodesSpec::default(),
@@ -257,6 +265,8 @@ pub enum KindSpec {
     Gripper,
     /// Truth values.
     Bool,
+    /// Components of a unit vector as recorded, such as cosine and sine of a yaw: never standardised.
+    Direction,
 }
 
 /// How commands become the action of row t, which acts between tick t and the next.

@@ -1,24 +1,27 @@
 //! A channel as decoding sees it: encodings and schema, and the library for channels that carry none.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use prost_reflect::MessageDescriptor;
 
 use super::error::CompileError;
 use super::schema::ros_library::{Library, SchemaFolderError, describe};
 use super::schema::ros_msg::{Dialect, Fault, library_type, parse_schema};
-use super::schema::{TypeTable, json_schema, proto};
+use super::schema::{TypeTable, json_schema, proto, ros_idl};
+use super::transcode::Transcoder;
+use super::transcode::flatbuffer::Reflection;
 
 /// What decoding needs to know of a channel.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ChannelSchema<'a> {
     /// Topic, for errors.
     pub topic: &'a str,
-    /// Message encoding of the channel: `cdr`, `ros1`, `protobuf`, `json`.
+    /// Message encoding of the channel: `cdr`, `ros1`, `protobuf`, `json`, `cbor`, `flatbuffer`.
     pub message_encoding: &'a str,
     /// Type name; empty without a schema. A contract may give it in place of the log.
     pub schema_name: &'a str,
-    /// Schema encoding: `ros2msg`, `ros1msg`, `protobuf`, `jsonschema`; empty without a schema.
+    /// Schema encoding: `ros2msg`, `ros2idl`, `ros1msg`, `protobuf`, `jsonschema`, `flatbuffer`; empty without a schema.
     pub schema_encoding: &'a str,
     /// The schema's bytes; empty without a schema.
     pub schema_data: &'a [u8],
@@ -51,6 +54,8 @@ pub(crate) struct Types {
     pub(crate) table: TypeTable,
     /// Protobuf only.
     pub(crate) descriptor: Option<MessageDescriptor>,
+    /// Turns payloads into what `encoding` says, where they are not that already.
+    pub(crate) transcoder: Option<Transcoder>,
 }
 
 impl SchemaLibrary {
@@ -76,19 +81,30 @@ impl SchemaLibrary {
 
     pub(crate) fn types(&self, channel: &ChannelSchema<'_>) -> Result<Types, CompileError> {
         match (channel.message_encoding, channel.schema_encoding) {
-            ("cdr", "ros2msg" | "ros1msg" | "") => self.ros_types(channel, Encoding::Cdr, Dialect::Ros2),
-            ("ros1", "ros1msg" | "") => self.ros_types(channel, Encoding::Ros1, Dialect::Ros1),
-            ("protobuf", "protobuf") => protobuf_types(channel),
-            ("json", "" | "jsonschema") => Ok(Types {
-                encoding: Encoding::Json,
-                table: json_schema::type_table(channel.schema_name, channel.schema_data)
-                    .map_err(|detail| bad_schema(channel, detail))?,
-                descriptor: None,
-            }),
-            // Some writers name no schema encoding that fits; JSON needs none.
-            ("json", _) => {
-                Ok(Types { encoding: Encoding::Json, table: json_schema::open(), descriptor: None })
+            // Some writers leave the message encoding out, or name the middleware.
+            ("cdr" | "ros2", "ros2msg" | "ros1msg" | "") | ("", "ros2msg") => {
+                self.ros_types(channel, Encoding::Cdr, Dialect::Ros2)
             }
+            ("cdr" | "ros2" | "", "ros2idl" | "omgidl") => {
+                let table = ros_idl::parse_schema(channel.schema_name, channel.schema_data, &self.ros);
+                Ok(cdr_types(table.map_err(|fault| ros_fault(channel, fault))?))
+            }
+            ("flatbuffer", "flatbuffer") => flatbuffer_types(channel),
+            ("cbor", "" | "jsonschema") => Ok(Types {
+                transcoder: Some(Transcoder::Cbor),
+                ..json_types(json_schema::type_table(channel.schema_name, channel.schema_data), channel)?
+            }),
+            ("cbor", _) => Ok(Types { transcoder: Some(Transcoder::Cbor), ..open_types() }),
+            ("ros1", "ros1msg" | "") | ("", "ros1msg") => {
+                self.ros_types(channel, Encoding::Ros1, Dialect::Ros1)
+            }
+            ("protobuf" | "", "protobuf") => protobuf_types(channel),
+            // A JSON schema says that messages are JSON, whatever the channel is labelled.
+            ("json", "" | "jsonschema") | ("" | "cdr" | "ros1" | "protobuf", "jsonschema") => {
+                json_types(json_schema::type_table(channel.schema_name, channel.schema_data), channel)
+            }
+            // Some writers name no schema encoding that fits; JSON needs none.
+            ("json", _) => Ok(open_types()),
             _ => Err(unsupported(channel)),
         }
     }
@@ -115,15 +131,38 @@ impl SchemaLibrary {
             parse_schema(channel.schema_name, b"", dialect, &self.ros)
         };
         let table = table.map_err(|fault| ros_fault(channel, fault))?;
-        Ok(Types { encoding, table, descriptor: None })
+        if encoding == Encoding::Cdr {
+            return Ok(cdr_types(table));
+        }
+        Ok(Types { encoding, table, descriptor: None, transcoder: None })
     }
+}
+
+fn cdr_types(table: TypeTable) -> Types {
+    let transcoder = Some(Transcoder::Cdr2(Arc::new(table.clone())));
+    Types { encoding: Encoding::Cdr, table, descriptor: None, transcoder }
+}
+
+fn json_types(table: Result<TypeTable, String>, channel: &ChannelSchema<'_>) -> Result<Types, CompileError> {
+    Ok(Types { table: table.map_err(|detail| bad_schema(channel, detail))?, ..open_types() })
+}
+
+fn open_types() -> Types {
+    Types { encoding: Encoding::Json, table: json_schema::open(), descriptor: None, transcoder: None }
+}
+
+fn flatbuffer_types(channel: &ChannelSchema<'_>) -> Result<Types, CompileError> {
+    let reflection = Reflection::parse(channel.schema_name, channel.schema_data)
+        .map_err(|detail| bad_schema(channel, detail))?;
+    let table = reflection.type_table();
+    Ok(Types { table, transcoder: Some(Transcoder::Flatbuffer(Arc::new(reflection))), ..open_types() })
 }
 
 fn protobuf_types(channel: &ChannelSchema<'_>) -> Result<Types, CompileError> {
     let wrap = |detail| bad_schema(channel, detail);
     let descriptor = proto::message_descriptor(channel.schema_name, channel.schema_data).map_err(wrap)?;
     let table = proto::type_table(&descriptor).map_err(wrap)?;
-    Ok(Types { encoding: Encoding::Protobuf, table, descriptor: Some(descriptor) })
+    Ok(Types { encoding: Encoding::Protobuf, table, descriptor: Some(descriptor), transcoder: None })
 }
 
 fn unsupported(channel: &ChannelSchema<'_>) -> CompileError {

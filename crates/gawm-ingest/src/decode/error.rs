@@ -8,7 +8,7 @@ use super::path::PathError;
 pub enum CompileError {
     /// The pair of message and schema encoding is one that gawm does not decode.
     #[error(
-        "cannot decode {topic:?}: message encoding {message_encoding:?} with schema encoding {schema_encoding:?} is not supported yet (supported: cdr with ros2msg, ros1 with ros1msg, protobuf, json)"
+        "cannot decode {topic:?}: message encoding {message_encoding:?} with schema encoding {schema_encoding:?} is not supported yet (supported: cdr with ros2msg, ros2idl or omgidl, ros1 with ros1msg, protobuf, json, cbor, flatbuffer with its reflection schema)"
     )]
     UnsupportedEncoding {
         /// Topic of the channel.

@@ -66,6 +66,22 @@ enum Part {
     Data,
 }
 
+impl ImageMessage<'_> {
+    /// Copies what is borrowed.
+    fn into_owned(self) -> ImageMessage<'static> {
+        ImageMessage {
+            stamp_ns: self.stamp_ns,
+            frame_id: Cow::Owned(self.frame_id.into_owned()),
+            format: Cow::Owned(self.format.into_owned()),
+            width: self.width,
+            height: self.height,
+            step: self.step,
+            is_big_endian: self.is_big_endian,
+            data: Cow::Owned(self.data.into_owned()),
+        }
+    }
+}
+
 impl ImagePlan {
     /// Compiles a plan for sensor_msgs Image and CompressedImage, foxglove RawImage and CompressedImage, and types like them.
     ///
@@ -155,6 +171,17 @@ impl ImagePlan {
     /// # Errors
     /// [`DecodeError`] if the message does not fit its schema.
     pub fn extract<'a>(
+        &self,
+        payload: &'a [u8],
+        sink: &mut RowSink,
+    ) -> Result<ImageMessage<'a>, DecodeError> {
+        match self.core.transcoded(payload)? {
+            Cow::Borrowed(payload) => self.extract_plain(payload, sink),
+            Cow::Owned(payload) => Ok(self.extract_plain(&payload, sink)?.into_owned()),
+        }
+    }
+
+    fn extract_plain<'a>(
         &self,
         payload: &'a [u8],
         sink: &mut RowSink,

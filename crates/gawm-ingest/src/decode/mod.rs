@@ -37,6 +37,7 @@ mod row;
 mod schema;
 mod stamp;
 mod to_json;
+mod transcode;
 
 #[cfg(test)]
 mod tests;

@@ -1,5 +1,6 @@
 //! A plan: what to read from the messages of one channel, compiled once.
 
+use std::borrow::Cow;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -10,6 +11,7 @@ use super::resolve::{NANOS, Requests, Resolver, SECONDS, Want};
 use super::row::{Decoded, Emit, ExactRow, Held, NumericRow, RowSink, Scalar, Scratch, Value};
 use super::schema::{Base, Field, Many, Prim, StructType, TypeTable};
 use super::stamp::{StampForm, StampUnit};
+use super::transcode::Transcoder;
 use super::{json, protobuf, ros};
 
 /// Numbers plans, so that a sink notices when it is used with another one.
@@ -54,6 +56,7 @@ pub struct DecodePlan {
 pub(crate) struct Core {
     id: u64,
     machine: Machine,
+    transcoder: Option<Transcoder>,
     pub(crate) requests: Requests,
     /// Slots that must have a value; the others are parts of the stamp.
     width: usize,
@@ -122,6 +125,7 @@ impl DecodePlan {
     /// # Errors
     /// [`DecodeError`] if the message does not fit its schema or the mapping; the sink is as before.
     pub fn decode(&self, payload: &[u8], sink: &mut RowSink) -> Result<Decoded, DecodeError> {
+        let payload = self.core.transcoded(payload)?;
         let start = sink.values.len();
         sink.values.resize(start + self.core.width, f64::NAN);
         let mut emit = NumericRow {
@@ -129,7 +133,7 @@ impl DecodePlan {
             stamp: super::stamp::Stamp::default(),
             text_slot: None,
         };
-        let outcome = self.core.run(payload, &mut sink.scratch, &mut emit);
+        let outcome = self.core.run(&payload, &mut sink.scratch, &mut emit);
         let (stamp, text_slot) = (emit.stamp, emit.text_slot);
         let outcome = match (outcome, text_slot) {
             (Ok(Decoded::Row { .. }), Some(slot)) => {
@@ -156,8 +160,9 @@ impl DecodePlan {
         payload: &[u8],
         sink: &mut RowSink,
     ) -> Result<(Decoded, Vec<Value>), DecodeError> {
+        let payload = self.core.transcoded(payload)?;
         let mut emit = ExactRow::new(self.core.width);
-        let outcome = self.core.run(payload, &mut sink.scratch, &mut emit)?;
+        let outcome = self.core.run(&payload, &mut sink.scratch, &mut emit)?;
         let Decoded::Row { .. } = outcome else { return Ok((outcome, Vec::new())) };
         let values = emit.values.into_iter().zip(&self.columns).map(|(held, column)| match held {
             Some(Held::Number(number)) => Ok(number.into_value()),
@@ -181,7 +186,9 @@ impl Core {
     ) -> Result<(Self, Vec<Range<usize>>, StampForm), CompileError> {
         let first = fields.first().map(|(path, _)| path);
         if types.encoding == Encoding::Json {
-            return Self::compile_json(channel, types, fields, stamp);
+            let (mut core, slots, form) = Self::compile_json(channel, types, fields, stamp)?;
+            core.transcoder.clone_from(&types.transcoder);
+            return Ok((core, slots, form));
         }
         let mut resolver = Resolver::new(channel.topic, &types.table);
         let mut slots = Vec::with_capacity(fields.len());
@@ -202,7 +209,17 @@ impl Core {
                 Machine::Protobuf { node, n_counters }
             }
         };
-        Ok((Self::new(machine, requests, width), slots, form))
+        let mut core = Self::new(machine, requests, width);
+        core.transcoder.clone_from(&types.transcoder);
+        Ok((core, slots, form))
+    }
+
+    /// Turns a payload into what the plan reads.
+    pub(crate) fn transcoded<'a>(&self, payload: &'a [u8]) -> Result<Cow<'a, [u8]>, DecodeError> {
+        match &self.transcoder {
+            Some(transcoder) => transcoder.apply(payload),
+            None => Ok(Cow::Borrowed(payload)),
+        }
     }
 
     fn compile_json(
@@ -234,7 +251,14 @@ impl Core {
 
     fn new(machine: Machine, requests: Requests, width: usize) -> Self {
         let wanted = requests.tables.iter().map(|t| t.wanted.len()).collect();
-        Self { id: NEXT_PLAN.fetch_add(1, Ordering::Relaxed), machine, requests, width, wanted }
+        Self {
+            id: NEXT_PLAN.fetch_add(1, Ordering::Relaxed),
+            machine,
+            requests,
+            width,
+            wanted,
+            transcoder: None,
+        }
     }
 
     /// Runs the plan over a message. The stamp of [`Decoded::Row`] is left for the caller to fill in.

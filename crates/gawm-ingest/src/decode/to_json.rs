@@ -1,5 +1,7 @@
 //! Whole messages as JSON: for `explain`, markers and task texts.
 
+use std::borrow::Cow;
+
 use serde_json::Value;
 
 use super::channel::{ChannelSchema, Encoding, SchemaLibrary, Types};
@@ -32,7 +34,12 @@ pub fn decode_to_json_limited(
     library: &SchemaLibrary,
     max_items: usize,
 ) -> Result<Value, DecodeError> {
-    let Types { encoding, table, descriptor } = library.types(channel)?;
+    let Types { encoding, table, descriptor, transcoder } = library.types(channel)?;
+    let payload = match &transcoder {
+        Some(transcoder) => transcoder.apply(payload)?,
+        None => Cow::Borrowed(payload),
+    };
+    let payload = payload.as_ref();
     match encoding {
         Encoding::Cdr => ros::whole::cdr_to_json(&table, payload, max_items),
         Encoding::Ros1 => ros::whole::ros1_to_json(&table, payload, max_items),

@@ -20,9 +20,11 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
+use crate::lerobot::{self, LerobotRecording};
 use crate::log::{
     Block, BlockKind, Channel, Damage, DamageKind, Log, OpenLogError, OpenOptions, discover, looks_like_zstd,
 };
+use crate::tabular;
 use statistics::{ChannelStatistics, Digest};
 
 pub use clocks::ClockOffset;
@@ -53,6 +55,9 @@ pub fn inspect(inputs: &[PathBuf], options: &OpenOptions, probe: &dyn MessagePro
             });
         }
         for part in &recording.parts {
+            if inspect_rows(part, &mut report) {
+                continue;
+            }
             match Log::open(part, options) {
                 Ok(log) => report.files.push(inspect_log(&log, part, probe)),
                 Err(error) => report.refused.push(refusal(&error)),
@@ -60,6 +65,30 @@ pub fn inspect(inputs: &[PathBuf], options: &OpenOptions, probe: &dyn MessagePro
         }
     }
     report
+}
+
+/// Inspects a table or a LeRobot folder; returns whether it is one.
+fn inspect_rows(path: &Path, report: &mut InspectReport) -> bool {
+    let refused = |error: String, hint: Option<&str>| Refusal {
+        path: path.display().to_string(),
+        error,
+        hint: hint.map(ToOwned::to_owned),
+    };
+    if lerobot::is_dataset(path) {
+        match LerobotRecording::open(path) {
+            Ok(recording) => report.datasets.push(recording.report()),
+            Err(error) => report.refused.push(refused(error.to_string(), error.hint())),
+        }
+        return true;
+    }
+    if !path.is_file() || !tabular::sniff(path).is_ok_and(|format| format.is_some()) {
+        return false;
+    }
+    match tabular::open(path, &tabular::Limits::default()) {
+        Ok(table) => report.tables.push(tabular::report(&table, None)),
+        Err(error) => report.refused.push(refused(error.to_string(), error.hint())),
+    }
+    true
 }
 
 fn refusal(error: &OpenLogError) -> Refusal {

@@ -6,7 +6,9 @@ use serde::Serialize;
 
 use super::clocks::ClockOffset;
 use super::statistics::Rate;
+use crate::lerobot::DatasetReport;
 use crate::log::{Damage, Severity};
+use crate::tabular::TableReport;
 
 /// All inspected files.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
@@ -15,6 +17,12 @@ pub struct InspectReport {
     pub files: Vec<FileReport>,
     /// Recordings of more than one file.
     pub recordings: Vec<RecordingReport>,
+    /// HDF5 and npz files.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub tables: Vec<TableReport>,
+    /// LeRobot folders.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub datasets: Vec<DatasetReport>,
     /// Files and folders that are no logs.
     pub refused: Vec<Refusal>,
 }
@@ -23,7 +31,10 @@ impl InspectReport {
     /// Returns whether anything is lost in any file, or any input was refused.
     pub fn has_loss(&self) -> bool {
         let is_loss = |damage: &Damage| damage.kind.severity() == Severity::Loss;
-        !self.refused.is_empty() || self.files.iter().any(|file| file.damage.iter().any(is_loss))
+        !self.refused.is_empty()
+            || self.files.iter().any(|file| file.damage.iter().any(is_loss))
+            || self.datasets.iter().any(|dataset| dataset.damage.iter().any(is_loss))
+            || self.tables.iter().flat_map(|table| &table.findings).any(|found| found.kind.is_loss())
     }
 }
 

@@ -30,6 +30,13 @@ pub fn render_text(report: &InspectReport) -> String {
         }
         render_file(&mut out, file);
     }
+    let tables = report.tables.iter().map(ToString::to_string);
+    for text in tables.chain(report.datasets.iter().map(ToString::to_string)) {
+        if !out.is_empty() {
+            out.push('\n');
+        }
+        out.push_str(&text);
+    }
     out
 }
 

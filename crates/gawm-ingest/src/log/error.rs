@@ -38,7 +38,9 @@ pub enum OpenLogError {
         found: Foreign,
     },
     /// A folder holds no log.
-    #[error("no log in this folder: expected .mcap files, got none: {path:?}")]
+    #[error(
+        "no log in this folder: expected .mcap, .h5, .hdf5 or .npz files or a LeRobot dataset, got none: {path:?}"
+    )]
     EmptyFolder {
         /// The folder.
         path: PathBuf,
@@ -70,7 +72,7 @@ impl OpenLogError {
             Self::Empty { .. } => {
                 Some("the recorder wrote nothing, or a copy failed; copy it again from the robot".to_owned())
             }
-            Self::EmptyFolder { .. } => Some("name the folder that holds the .mcap files".to_owned()),
+            Self::EmptyFolder { .. } => Some("name the folder that holds the logs".to_owned()),
             Self::BadRosbag2Metadata { .. } => Some(
                 "repair it with `ros2 bag reindex`, or name the .mcap files instead of the folder".to_owned(),
             ),

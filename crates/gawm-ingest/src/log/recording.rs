@@ -32,8 +32,9 @@ pub struct Discovery {
 
 /// Finds the recordings at the named files and folders.
 ///
-/// A folder with a rosbag2 `metadata.yaml` is one recording. In other folders, files named `x_0.mcap`, `x_1.mcap`, … without
-/// a hole are the parts of one recording, and every other `.mcap` file is one of its own; folders below are searched too.
+/// A folder with a rosbag2 `metadata.yaml`, and a LeRobot folder, is one recording. In other folders, files named `x_0.mcap`, `x_1.mcap`, … without
+/// a hole are the parts of one recording, and every other `.mcap`, `.h5`, `.hdf5` or `.npz` file is one of its own; folders
+/// below are searched too.
 /// Named files are recordings of their own, except when all parts that a `metadata.yaml` beside them lists are named.
 /// A file that is named twice counts once.
 pub fn discover(inputs: &[PathBuf]) -> Discovery {
@@ -106,6 +107,9 @@ fn file(path: &Path, named: &BTreeSet<PathBuf>, seen: &mut BTreeSet<PathBuf>, to
 
 /// Takes a folder that was named, or one below it.
 fn folder(path: &Path, depth: usize, seen: &mut BTreeSet<PathBuf>, to: &mut Discovery) {
+    if crate::lerobot::is_dataset(path) {
+        return push(vec![path.to_owned()], name_of(path), None, seen, to);
+    }
     match Rosbag2Metadata::read(path) {
         Ok(Some(metadata)) => return bag(path, metadata, seen, to),
         Ok(None) => {}
@@ -149,8 +153,6 @@ fn foreign_by_name(path: &Path) -> Option<Foreign> {
     let foreign = [
         (".bag", Foreign::RosBag1),
         (".db3", Foreign::Sqlite),
-        (".mcap.zstd", Foreign::Compressed { name: "zstd" }),
-        (".mcap.zst", Foreign::Compressed { name: "zstd" }),
         (".mcap.gz", Foreign::Compressed { name: "gzip" }),
         (".mcap.lz4", Foreign::Compressed { name: "lz4" }),
         (".db3.zstd", Foreign::Sqlite),
@@ -158,11 +160,11 @@ fn foreign_by_name(path: &Path) -> Option<Foreign> {
     foreign.into_iter().find(|(ending, _)| name.ends_with(ending)).map(|(_, foreign)| foreign)
 }
 
-/// Groups the `.mcap` files of a folder without metadata, in order of their names.
+/// Groups the logs and tables of a folder without metadata, in order of their names.
 fn grouped(files: &[PathBuf]) -> Vec<(String, Vec<PathBuf>)> {
     let mut numbered: BTreeMap<String, BTreeMap<u64, PathBuf>> = BTreeMap::new();
     let mut groups = Vec::new();
-    for path in files.iter().filter(|path| path.extension().is_some_and(|ending| ending == "mcap")) {
+    for path in files.iter().filter(|path| is_log(path)) {
         match split_number(path) {
             // `x_1.mcap` and `x_01.mcap` would be the same part; the second is one of its own.
             Some((stem, number)) if !numbered.get(&stem).is_some_and(|parts| parts.contains_key(&number)) => {
@@ -179,13 +181,26 @@ fn grouped(files: &[PathBuf]) -> Vec<(String, Vec<PathBuf>)> {
             groups.extend(parts.into_values().map(|path| (name_of(&path), vec![path])));
         }
     }
+    groups.extend(files.iter().filter(|path| is_table(path)).map(|path| (name_of(path), vec![path.clone()])));
     groups.sort_by(|a, b| a.1.cmp(&b.1));
     groups
 }
 
+/// Tells a log by its name; rosbag2 may have compressed it as a whole.
+fn is_log(path: &Path) -> bool {
+    let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    [".mcap", ".mcap.zstd", ".mcap.zst"].iter().any(|ending| name.ends_with(ending))
+}
+
+/// Tells a table by its name: other files of a folder are not opened.
+fn is_table(path: &Path) -> bool {
+    path.extension().is_some_and(|ending| ["h5", "hdf5", "npz"].iter().any(|known| ending == *known))
+}
+
 /// Splits `name_12.mcap` into `name` and 12.
 fn split_number(path: &Path) -> Option<(String, u64)> {
-    let (stem, digits) = path.file_stem()?.to_str()?.rsplit_once('_')?;
+    let stem = path.file_name()?.to_str()?.split(".mcap").next()?;
+    let (stem, digits) = stem.rsplit_once('_')?;
     let is_number = !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit());
     Some((stem.to_owned(), digits.parse().ok().filter(|_| is_number)?))
 }

@@ -17,6 +17,8 @@ mod report;
 mod session;
 mod sink;
 mod source;
+mod unavailable;
+mod unpack;
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -162,7 +164,17 @@ impl Run<'_> {
             Ok(open) => open,
             Err(error) => return Ok(FileReport::refused(&path, with_hint(&error.to_string(), error.hint()))),
         };
-        let binding = match Binding::new(self.options.contract, &open.name, &open.channels, &self.library) {
+        let reduced = unavailable::reduce(self.options.contract, &open);
+        let left_out = reduced.as_ref().map(|reduced| reduced.left_out.clone()).unwrap_or_default();
+        if let Some((stream, found)) =
+            reduced.as_ref().and_then(|r| Some((r.lost_ticks.as_ref()?, r.left_out.first()?)))
+        {
+            let error = format!("stream {stream:?} gives the ticks, and has no values: {}", found.detail);
+            let hint = Some("choose another ticks.stream, or ticks.mode = \"native\"".to_owned());
+            return Ok(FileReport::refused(&path, with_hint(&error, hint)));
+        }
+        let contract = reduced.as_ref().map_or(self.options.contract, |reduced| &reduced.contract);
+        let binding = match Binding::new(contract, &open.name, &open.channels, &self.library) {
             Ok(binding) => binding,
             Err(BindError::Run(error)) => return Err(error),
             Err(BindError::Refused(refusal)) => {
@@ -198,7 +210,11 @@ impl Run<'_> {
             binding: &binding,
         };
         let outcome = recording::write(&context, &open, &path, writer)?;
-        Ok(self.account(outcome, report))
+        let mut file = self.account(outcome, report);
+        if file.status != FileStatus::AlreadyThere {
+            unavailable::account(&left_out, &mut file, report);
+        }
+        Ok(file)
     }
 
     /// Returns every topic that a contract asks for: of streams, labels and markers.

@@ -193,13 +193,7 @@ fn recording_info(open: &OpenRecording) -> Result<RecordingInfo, RunError> {
         [only] => only.content_hash,
         _ => ContentHash(*whole.finalize().as_bytes()),
     };
-    let notes = open.logs.first().map(|log| {
-        log.notes()
-            .into_iter()
-            .filter(|(_, value)| !value.is_empty())
-            .map(|(key, value)| (key.to_owned(), value.to_owned()))
-            .collect()
-    });
+    let notes = open.logs.first().map(Source::notes);
     Ok(RecordingInfo { content_hash, files, notes: notes.unwrap_or_default() })
 }
 
@@ -227,7 +221,14 @@ fn write_episodes(
         .collect();
     let plans = Plans::new(context.binding, &events, &infos, context.library);
     let rule = context.binding.align_rule(contract)?;
-    let rules = SessionRules { contract, binding: context.binding, plans: &plans, rule: &rule, label_fields };
+    let rules = SessionRules {
+        contract,
+        binding: context.binding,
+        plans: &plans,
+        rule: &rule,
+        label_fields,
+        is_listed: matches!(contract.episodes, EpisodeRule::Metadata { .. }),
+    };
     let sink_rules = SinkRules {
         schema: context.schema,
         images: image_rules(context.binding),

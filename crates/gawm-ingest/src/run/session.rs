@@ -30,6 +30,8 @@ pub(crate) struct SessionRules<'a> {
     pub(crate) rule: &'a AlignRule,
     /// Expected size of the pictures of each stream, before crop and resize; learned from the first.
     pub(crate) label_fields: Vec<(String, String)>,
+    /// Whether records give the times of episodes, so that the time between them says nothing.
+    pub(crate) is_listed: bool,
 }
 
 /// The state of a recording.
@@ -342,6 +344,7 @@ impl<'a, 's> Session<'a, 's> {
         self.ordinal += 1;
         let window = self.rules.contract.disorder_window_ns;
         if let Some(newest) = self.newest_log_ns
+            && !self.rules.is_listed
             && message.log_ns.saturating_sub(newest) > self.rules.contract.max_gap_ns
         {
             let gap_s = message.log_ns.saturating_sub(newest) as f64 / 1e9;

@@ -1,20 +1,33 @@
-//! What a recording is read from: an MCAP file, or a table of rows in the form of one.
+//! What a recording is read from: an MCAP file, or rows in the form of one.
 
+use std::collections::BTreeMap;
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::open_options;
+use super::unpack::{UnpackError, is_packed, unpack};
 use crate::contract::{CheckedContract, TickRule};
+use crate::lerobot::{self, LerobotError, LerobotRecording};
 use crate::log::{Block, BlockRef, Channel, Damage, Log, MetadataRecord, OpenLogError, SummaryCounts};
+use crate::rows::{RowRecording, Unavailable};
 use crate::tabular::{Limits, OpenTableError, RecordingError, TableRecording, open, sniff};
 
-/// One open file.
+/// One open file or folder.
 pub(crate) enum Source {
     /// An MCAP file.
     Log(Box<Log>),
-    /// HDF5 or npz.
-    Table(Box<TableRecording>),
+    /// An MCAP file that was compressed as a whole: the file itself, and what it was unpacked into.
+    Packed {
+        /// The file as named.
+        path: PathBuf,
+        /// What it holds.
+        log: Box<Log>,
+        /// Removed when it is dropped.
+        _unpacked: tempfile::NamedTempFile,
+    },
+    /// HDF5, npz or a LeRobot folder.
+    Rows(Box<dyn RowRecording>),
 }
 
 /// Why a file is refused.
@@ -27,11 +40,17 @@ pub(crate) enum OpenError {
     /// It is a table that cannot be read.
     #[error(transparent)]
     Table(#[from] OpenTableError),
+    /// It is a compressed log that cannot be unpacked.
+    #[error(transparent)]
+    Unpack(#[from] UnpackError),
+    /// It is a LeRobot folder that cannot be read.
+    #[error(transparent)]
+    Lerobot(#[from] LerobotError),
     /// It is a table without episodes.
     #[error("{source}: {path:?}")]
     Recording {
         /// The file.
-        path: std::path::PathBuf,
+        path: PathBuf,
         /// What is wrong with it.
         source: RecordingError,
     },
@@ -39,7 +58,7 @@ pub(crate) enum OpenError {
     #[error("rows per second: expected ticks.fps or ticks.rate_hz in the contract, got neither: {path:?}")]
     NoRate {
         /// The file.
-        path: std::path::PathBuf,
+        path: PathBuf,
     },
 }
 
@@ -49,8 +68,12 @@ impl OpenError {
         match self {
             OpenError::Log(error) => error.hint(),
             OpenError::Table(error) => error.hint().map(ToOwned::to_owned),
+            OpenError::Lerobot(error) => error.hint().map(ToOwned::to_owned),
             OpenError::Recording { source: RecordingError::Layout(error), .. } => {
                 error.hint().map(ToOwned::to_owned)
+            }
+            OpenError::Unpack(_) => {
+                Some("unpack it yourself (zstd -d), or set TMPDIR to a folder with room".to_owned())
             }
             OpenError::Recording { .. } => None,
             OpenError::NoRate { .. } => Some(
@@ -62,8 +85,11 @@ impl OpenError {
 }
 
 impl Source {
-    /// Opens a file, told apart by content.
+    /// Opens a file or folder, told apart by content.
     pub(crate) fn open(path: &Path, contract: &CheckedContract) -> Result<Source, OpenError> {
+        if lerobot::is_dataset(path) {
+            return Ok(Source::Rows(Box::new(LerobotRecording::open(path)?)));
+        }
         // What cannot be read at all is the log's to report.
         if path.is_file() && sniff(path).is_ok_and(|format| format.is_some()) {
             let rate_hz = match (contract.written.ticks.fps, &contract.ticks) {
@@ -74,9 +100,14 @@ impl Source {
                 }
             };
             let table = open(path, &Limits::default())?;
-            let recording = TableRecording::try_new(table, None, rate_hz)
+            let recording = TableRecording::try_new(table, contract.written.layout.as_ref(), rate_hz)
                 .map_err(|source| OpenError::Recording { path: path.to_owned(), source })?;
-            return Ok(Source::Table(Box::new(recording)));
+            return Ok(Source::Rows(Box::new(recording)));
+        }
+        if is_packed(path) {
+            let unpacked = unpack(path)?;
+            let log = Box::new(Log::open(unpacked.path(), &open_options(contract))?);
+            return Ok(Source::Packed { path: path.to_owned(), log, _unpacked: unpacked });
         }
         Ok(Source::Log(Box::new(Log::open(path, &open_options(contract))?)))
     }
@@ -84,92 +115,106 @@ impl Source {
     /// Returns the MCAP file, if it is one.
     pub(crate) fn as_log(&self) -> Option<&Log> {
         match self {
-            Source::Log(log) => Some(log),
-            Source::Table(_) => None,
+            Source::Log(log) | Source::Packed { log, .. } => Some(log),
+            Source::Rows(_) => None,
         }
     }
 
     pub(crate) fn path(&self) -> &Path {
         match self {
             Source::Log(log) => log.path(),
-            Source::Table(table) => table.table().path(),
+            Source::Packed { path, .. } => path,
+            Source::Rows(rows) => rows.path(),
         }
     }
 
     pub(crate) fn file_bytes(&self) -> u64 {
         match self {
-            Source::Log(log) => log.file_bytes(),
-            // A file that is gone since has been hashed before, and then the run has failed.
-            Source::Table(table) => std::fs::metadata(table.table().path()).map_or(0, |m| m.len()),
+            Source::Log(log) | Source::Packed { log, .. } => log.file_bytes(),
+            Source::Rows(rows) => rows.file_bytes(),
         }
     }
 
     pub(crate) fn content_hash(&self) -> io::Result<[u8; 32]> {
         match self {
-            Source::Log(log) => log.content_hash(),
-            Source::Table(table) => table.content_hash(),
+            Source::Log(log) | Source::Packed { log, .. } => log.content_hash(),
+            Source::Rows(rows) => rows.content_hash(),
         }
     }
 
-    /// Returns what the writer said of itself.
-    pub(crate) fn notes(&self) -> [(&'static str, &str); 2] {
+    /// Returns what the writer said of itself, and what is worth keeping of columns.
+    pub(crate) fn notes(&self) -> BTreeMap<String, String> {
         match self {
-            Source::Log(log) => [("library", log.library()), ("profile", log.profile())],
-            Source::Table(table) => [("layout", table.episodes().layout.name()), ("profile", "")],
+            Source::Log(log) | Source::Packed { log, .. } => {
+                [("library", log.library()), ("profile", log.profile())]
+                    .into_iter()
+                    .filter(|(_, value)| !value.is_empty())
+                    .map(|(key, value)| (key.to_owned(), value.to_owned()))
+                    .collect()
+            }
+            Source::Rows(rows) => rows.notes(),
         }
     }
 
     pub(crate) fn channels(&self) -> Vec<Arc<Channel>> {
         match self {
-            Source::Log(log) => log.channels().values().cloned().collect(),
-            Source::Table(table) => table.channels().to_vec(),
+            Source::Log(log) | Source::Packed { log, .. } => log.channels().values().cloned().collect(),
+            Source::Rows(rows) => rows.channels().to_vec(),
         }
     }
 
     pub(crate) fn metadata(&self) -> &[MetadataRecord] {
         match self {
-            Source::Log(log) => log.metadata(),
-            Source::Table(table) => table.metadata(),
+            Source::Log(log) | Source::Packed { log, .. } => log.metadata(),
+            Source::Rows(rows) => rows.metadata(),
         }
     }
 
     pub(crate) fn damage(&self) -> &[Damage] {
         match self {
-            Source::Log(log) => log.damage(),
-            Source::Table(table) => table.damage(),
+            Source::Log(log) | Source::Packed { log, .. } => log.damage(),
+            Source::Rows(rows) => rows.damage(),
         }
     }
 
     pub(crate) fn summary_counts(&self) -> Option<&SummaryCounts> {
         match self {
-            Source::Log(log) => log.summary_counts(),
-            Source::Table(_) => None,
+            Source::Log(log) | Source::Packed { log, .. } => log.summary_counts(),
+            Source::Rows(_) => None,
         }
     }
 
     pub(crate) fn blocks(&self) -> &[BlockRef] {
         match self {
-            Source::Log(log) => log.blocks(),
-            Source::Table(table) => table.blocks(),
+            Source::Log(log) | Source::Packed { log, .. } => log.blocks(),
+            Source::Rows(rows) => rows.blocks(),
         }
     }
 
     pub(crate) fn read_block(&self, block: &BlockRef) -> Block {
         match self {
-            Source::Log(log) => log.read_block(block),
-            Source::Table(table) => table.read_block(block),
+            Source::Log(log) | Source::Packed { log, .. } => log.read_block(block),
+            Source::Rows(rows) => rows.read_block(block),
         }
     }
 
     /// Reads only these topics from now on, where that saves work.
     pub(crate) fn select(&mut self, topics: &[String]) {
-        if let Source::Table(table) = self {
-            table.select(topics.iter().cloned());
+        if let Source::Rows(rows) = self {
+            rows.select(topics);
         }
     }
 
     /// Returns whether the file lists its episodes itself.
     pub(crate) fn has_episodes(&self) -> bool {
-        matches!(self, Source::Table(_))
+        matches!(self, Source::Rows(_))
+    }
+
+    /// Returns the topics that are declared and have no values.
+    pub(crate) fn unavailable(&self) -> &[Unavailable] {
+        match self {
+            Source::Log(_) | Source::Packed { .. } => &[],
+            Source::Rows(rows) => rows.unavailable(),
+        }
     }
 }

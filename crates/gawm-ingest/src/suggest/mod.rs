@@ -12,6 +12,7 @@ mod lag;
 mod measure;
 mod names;
 mod render;
+mod rows;
 mod stream_names;
 mod survey;
 mod urdf;
@@ -22,7 +23,9 @@ use thiserror::Error;
 
 use crate::contract::Contract;
 use crate::decode::SchemaLibrary;
-use crate::log::{OpenLogError, OpenOptions};
+use crate::lerobot::{self, LerobotRecording};
+use crate::log::{OpenLogError, OpenOptions, discover};
+use crate::tabular;
 
 pub use survey::DecodingProbe;
 
@@ -84,6 +87,9 @@ pub fn suggest(
     library: &SchemaLibrary,
     options: &OpenOptions,
 ) -> Result<Suggestion, SuggestError> {
+    if let Some(suggestion) = of_rows(inputs) {
+        return suggestion;
+    }
     let survey = survey::survey(inputs, library, options)?;
     let mut suggestion = guess::guess(&survey, library);
     if suggestion.contract.stream.is_empty() {
@@ -93,6 +99,37 @@ pub fn suggest(
     episodes::guess(&mut suggestion, &survey);
     stream_names::name_streams(&mut suggestion.contract);
     Ok(suggestion)
+}
+
+/// Suggests from the first input, if that is a table or a LeRobot folder.
+fn of_rows(inputs: &[PathBuf]) -> Option<Result<Suggestion, SuggestError>> {
+    let found = discover(inputs);
+    let path = found.recordings.first()?.parts.first()?;
+    let unreadable = |error: String, hint: Option<&str>| SuggestError::NoLog {
+        reasons: vec![error],
+        hint: hint.map(Into::into),
+    };
+    let suggestion = if lerobot::is_dataset(path) {
+        LerobotRecording::open(path)
+            .map(|recording| rows::of_lerobot(&recording))
+            .map_err(|error| unreadable(error.to_string(), error.hint()))
+    } else if path.is_file() && tabular::sniff(path).is_ok_and(|format| format.is_some()) {
+        tabular::open(path, &tabular::Limits::default())
+            .map_err(|error| unreadable(error.to_string(), error.hint()))
+            .and_then(|table| {
+                let report = tabular::report(&table, None);
+                match &report.no_layout {
+                    Some(why) => Err(unreadable(format!("{why}: {}", path.display()), None)),
+                    None => Ok(rows::of_table(&report)),
+                }
+            })
+    } else {
+        return None;
+    };
+    Some(suggestion.and_then(|suggestion| match suggestion.contract.stream.is_empty() {
+        true => Err(SuggestError::NothingToMap { topics: suggestion.unmapped }),
+        false => Ok(suggestion),
+    }))
 }
 
 /// Returns the contract as TOML with comments.

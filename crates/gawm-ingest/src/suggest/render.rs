@@ -24,6 +24,9 @@ fn write(text: &mut String, suggestion: &Suggestion) -> std::fmt::Result {
     writeln!(text, "# Read it, correct it, then: gawm-ingest run --config THIS.toml --out DATASET LOG...")?;
     writeln!(text, "# docs/contract.md says what every key means.\n")?;
     writeln!(text, "version = 1")?;
+    if let Some(robot_type) = &contract.robot_type {
+        writeln!(text, "robot_type = {}", toml::Value::String(robot_type.clone()))?;
+    }
     if contract.disorder_window_ms != defaults.disorder_window_ms
         || suggestion.reasons.contains_key("disorder_window_ms")
     {

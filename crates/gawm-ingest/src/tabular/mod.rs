@@ -30,12 +30,13 @@ use std::io::Read;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
+pub use crate::rows::EPISODE_GAP_NS;
 pub use column::{Attribute, AttributeValue, Column, Dtype, Filter, Rows, Values};
 pub use error::{OpenTableError, ReadError};
 pub use finding::{Finding, FindingKind};
 pub use layout::{ColumnRows, Episode, EpisodeEnd, Episodes, Extent, Layout, LayoutError};
 use raw::{RawForm, RawType};
-pub use recording::{EPISODE_GAP_NS, RecordingError, TableRecording};
+pub use recording::{RecordingError, TableRecording};
 pub use report::{ColumnReport, TableReport, report};
 pub use samples::{Batch, SampleError, SampleReader, Selection, StreamBatch, StreamRequest};
 

@@ -16,6 +16,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
+use std::path::Path;
 use std::sync::Arc;
 
 use bytes::Bytes;
@@ -25,16 +26,11 @@ use super::error::ReadError;
 use super::finding::{Finding, FindingKind};
 use super::raw;
 use super::{Episode, Episodes, Extent, LayoutError, Table};
-use crate::log::{Block, BlockRef, Channel, Damage, DamageKind, Message, MetadataRecord, Schema};
-
-/// Time between two episodes: above the largest `max_gap_s` of a contract, an hour.
-pub const EPISODE_GAP_NS: i64 = 2 * 3_600 * 1_000_000_000;
-
-/// A block holds rows of about this many bytes, or one row.
-const BLOCK_BYTES: u64 = 8 << 20;
-
-/// Bytes before the values of a CDR message: little-endian, no options.
-const CDR_HEADER: [u8; 4] = [0, 1, 0, 0];
+use crate::log::{Block, BlockRef, Channel, Damage, DamageKind, Message, MetadataRecord};
+use crate::rows::{
+    self, BLOCK_BYTES, CDR_HEADER, EPISODE_GAP_NS, HEADER_TEXT, RowRecording, align, push_bytes, push_header,
+    push_text,
+};
 
 /// Why a table cannot be taken as a log.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -149,45 +145,9 @@ impl TableRecording {
         &self.found
     }
 
-    /// Returns one channel per column, sorted by topic.
-    pub fn channels(&self) -> &[Arc<Channel>] {
-        &self.channels
-    }
-
-    /// Returns one record named `episode` per episode.
-    pub fn metadata(&self) -> &[MetadataRecord] {
-        &self.metadata
-    }
-
     /// Returns what was noticed about the file and its episodes.
     pub fn findings(&self) -> impl Iterator<Item = &Finding> {
         self.table.findings().iter().chain(&self.found.findings)
-    }
-
-    /// Returns the findings that mean loss or doubt, in the terms of logs.
-    pub fn damage(&self) -> &[Damage] {
-        &self.damage
-    }
-
-    /// Hashes the file's bytes with BLAKE3.
-    ///
-    /// # Errors
-    /// The operating system fails to read it.
-    pub fn content_hash(&self) -> std::io::Result<[u8; 32]> {
-        let mut hasher = blake3::Hasher::new();
-        std::io::copy(&mut std::fs::File::open(self.table.path())?, &mut hasher)?;
-        Ok(*hasher.finalize().as_bytes())
-    }
-
-    /// Reads these columns only from now on, so that images nobody asked for are not decoded.
-    pub fn select(&mut self, topics: impl IntoIterator<Item = String>) {
-        self.selected = topics.into_iter().collect();
-        self.list_blocks();
-    }
-
-    /// Returns the blocks in order of time.
-    pub fn blocks(&self) -> &[BlockRef] {
-        &self.blocks
     }
 
     fn list_blocks(&mut self) {
@@ -220,8 +180,67 @@ impl TableRecording {
         self.starts_ns.get(episode).map_or(since, |start| start.saturating_add(since))
     }
 
-    /// Reads a block: never fails; what was lost is in its damage. Blocks may be read from many threads.
-    pub fn read_block(&self, block: &BlockRef) -> Block {
+    /// Hashes the columns that are used: HDF5 has no checksums of its own, so this shows later damage.
+    ///
+    /// A column that cannot be read has none; reading it for rows says why.
+    fn column_hashes(&self) -> BTreeMap<String, String> {
+        let mut notes = BTreeMap::new();
+        for channel in self.channels.iter().filter(|channel| self.selected.contains(&channel.topic)) {
+            let columns = self.found.episodes.iter().filter_map(|e| e.columns.get(channel.topic.as_str()));
+            let mut paths: Vec<&str> = columns.map(|at| &*at.path).collect();
+            paths.dedup();
+            let hashes: Option<Vec<[u8; 32]>> =
+                paths.iter().map(|path| self.table.content_hash(path).ok()).collect();
+            let hash = match hashes.as_deref() {
+                Some([only]) => blake3::Hash::from_bytes(*only),
+                Some(several) => blake3::hash(several.as_flattened()),
+                None => continue,
+            };
+            notes.insert(format!("column {}", channel.topic), hash.to_hex().to_string());
+        }
+        notes
+    }
+}
+
+impl RowRecording for TableRecording {
+    fn path(&self) -> &Path {
+        self.table.path()
+    }
+
+    fn file_bytes(&self) -> u64 {
+        // A file that is gone since has been hashed before, and then the run has failed.
+        std::fs::metadata(self.table.path()).map_or(0, |about| about.len())
+    }
+
+    fn notes(&self) -> BTreeMap<String, String> {
+        let mut notes = self.column_hashes();
+        notes.insert("layout".to_owned(), self.found.layout.name().to_owned());
+        notes
+    }
+
+    fn channels(&self) -> &[Arc<Channel>] {
+        &self.channels
+    }
+
+    fn metadata(&self) -> &[MetadataRecord] {
+        &self.metadata
+    }
+
+    fn damage(&self) -> &[Damage] {
+        &self.damage
+    }
+
+    fn content_hash(&self) -> std::io::Result<[u8; 32]> {
+        let mut hasher = blake3::Hasher::new();
+        std::io::copy(&mut std::fs::File::open(self.table.path())?, &mut hasher)?;
+        Ok(*hasher.finalize().as_bytes())
+    }
+
+    fn blocks(&self) -> &[BlockRef] {
+        &self.blocks
+    }
+
+    fn read_block(&self, block: &BlockRef) -> Block {
         let mut out = Block::default();
         let span = usize::try_from(block.offset).ok().and_then(|at| self.spans.get(at));
         let Some((block, episode)) = span.and_then(|s| Some((s, self.found.episodes.get(s.episode)?))) else {
@@ -265,6 +284,11 @@ impl TableRecording {
         out.data = Bytes::from(data);
         out
     }
+
+    fn select(&mut self, topics: &[String]) {
+        self.selected = topics.iter().cloned().collect();
+        self.list_blocks();
+    }
 }
 
 /// Says a finding in the terms of logs; what concerns columns that nobody may ask for is no damage of the file.
@@ -306,7 +330,7 @@ fn channels(table: &Table, found: &Episodes) -> Result<Vec<Arc<Channel>>, Record
 
 fn channel(topic: &str, column: &Column, id: u16) -> Channel {
     let (name, text) = match image_encoding(column) {
-        Some(_) => ("sensor_msgs/msg/Image".to_owned(), IMAGE_TEXT.to_owned()),
+        Some(_) => ("sensor_msgs/msg/Image".to_owned(), format!("{IMAGE_FIELDS}{HEADER_TEXT}")),
         None => {
             let element = ros_type(column.dtype);
             let text = match column.row_elements() {
@@ -316,20 +340,10 @@ fn channel(topic: &str, column: &Column, id: u16) -> Channel {
             ("gawm_msgs/msg/Row".to_owned(), text)
         }
     };
-    let schema = Schema { id, name, encoding: "ros2msg".to_owned(), data: Bytes::from(text) };
-    Channel {
-        id,
-        topic: topic.to_owned(),
-        message_encoding: "cdr".to_owned(),
-        metadata: BTreeMap::new(),
-        schema_id: id,
-        schema: Some(Arc::new(schema)),
-    }
+    rows::channel(topic, &name, text, id)
 }
 
-const IMAGE_TEXT: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n\
-    ================================================================================\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
-    ================================================================================\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
+const IMAGE_FIELDS: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n";
 
 fn image_encoding(column: &Column) -> Option<&'static str> {
     column.image_shape().map(|[_, _, channels]| match channels {
@@ -466,13 +480,7 @@ impl Writer<'_> {
         let u32_of = |n: u64| u32::try_from(n).unwrap_or(u32::MAX).to_le_bytes();
         for row in rows {
             self.table.read_image(self.path, self.first_row + row, &mut pixels)?;
-            let start = data.len();
-            data.extend_from_slice(&CDR_HEADER);
-            let time_ns = time_ns(row);
-            let seconds = i32::try_from(time_ns / 1_000_000_000).unwrap_or(i32::MAX);
-            data.extend_from_slice(&seconds.to_le_bytes());
-            data.extend_from_slice(&((time_ns % 1_000_000_000) as u32).to_le_bytes());
-            push_text("", start, data);
+            let start = push_header(time_ns(row), data);
             align(start, 4, data);
             data.extend_from_slice(&u32_of(height));
             data.extend_from_slice(&u32_of(width));
@@ -480,8 +488,7 @@ impl Writer<'_> {
             data.push(0);
             align(start, 4, data);
             data.extend_from_slice(&u32_of(width.saturating_mul(channels)));
-            data.extend_from_slice(&u32_of(pixels.len() as u64));
-            data.extend_from_slice(&pixels);
+            push_bytes(&pixels, start, data);
             take(row, start..data.len());
         }
         Ok(())
@@ -503,20 +510,6 @@ fn write_texts(
         take(row, start..data.len());
     }
     Ok(())
-}
-
-/// Appends a CDR string: length with its NUL, bytes, NUL.
-fn push_text(text: &str, start: usize, data: &mut Vec<u8>) {
-    align(start, 4, data);
-    data.extend_from_slice(&(text.len() as u32).saturating_add(1).to_le_bytes());
-    data.extend_from_slice(text.as_bytes());
-    data.push(0);
-}
-
-/// Pads to a multiple of `unit` after the header.
-fn align(start: usize, unit: usize, data: &mut Vec<u8>) {
-    let at = data.len() - start - CDR_HEADER.len();
-    data.resize(data.len() + at.next_multiple_of(unit) - at, 0);
 }
 
 fn is_all_nan(values: &[u8], dtype: Dtype) -> bool {

@@ -74,9 +74,23 @@ impl Losses {
 /// - if a term needs a head that the model does not have, or shapes do not fit the model.
 pub fn losses(model: &WorldModel, clips: &Clips, objectives: &Objectives, pass: &Pass) -> Result<Losses> {
     let clips = objectives.control.apply(clips, pass)?;
-    let (_, t, _, _, _) = clips.frames.dims5()?;
-
     let z = model.encode(&clips.frames, pass)?.to_dtype(DType::F32)?; // [B, T, D]
+    latent_losses(model, &z, &clips, objectives, pass)
+}
+
+/// Computes the loss of a batch whose latents `z` [B, T, D] are known, f32; no control is applied.
+///
+/// # Errors
+///
+/// - as [`losses`].
+pub fn latent_losses(
+    model: &WorldModel,
+    z: &Tensor,
+    clips: &Clips,
+    objectives: &Objectives,
+    pass: &Pass,
+) -> Result<Losses> {
+    let (_, t, _) = z.dims3()?;
     let c = model.embed_actions(&clips.actions, pass)?; // [B, T, D]
     let (past, next) = (z.narrow(1, 0, t - 1)?, z.narrow(1, 1, t - 1)?); // [B, T-1, D]
     let actions = clips.actions.narrow(1, 0, t - 1)?; // [B, T-1, A]; the last chunk leaves the clip
@@ -87,19 +101,19 @@ pub fn losses(model: &WorldModel, clips: &Clips, objectives: &Objectives, pass: 
             mean_squared_error(&predicted, &next)
         }
         Term::StateAlignment => {
-            state_alignment(&model.read_states(&z, pass)?, &clips.states, &clips.state_mask)
+            state_alignment(&model.read_states(z, pass)?, &clips.states, &clips.state_mask)
         }
-        Term::InverseDynamics => mean_squared_error(&model.read_actions(&z, pass)?, &actions),
+        Term::InverseDynamics => mean_squared_error(&model.read_actions(z, pass)?, &actions),
         Term::Sigreg => {
             let directions = sigreg_projections(z.dim(2)?, objectives.sigreg_projections, pass, z.device())?;
             sigreg(&z.transpose(0, 1)?, &directions)
         }
-        Term::Std => standard_deviation(&centre(&z)?),
-        Term::StdTime => standard_deviation(&centre(&z)?.transpose(0, 1)?),
-        Term::Covariance => covariance(&centre(&z)?),
-        Term::CovarianceTime => covariance(&centre(&z)?.transpose(0, 1)?),
+        Term::Std => standard_deviation(&centre(z)?),
+        Term::StdTime => standard_deviation(&centre(z)?.transpose(0, 1)?),
+        Term::Covariance => covariance(&centre(z)?),
+        Term::CovarianceTime => covariance(&centre(z)?.transpose(0, 1)?),
         Term::TemporalAlignment => mean_squared_error(&past, &next),
-        Term::Straightening => straightening(&z),
+        Term::Straightening => straightening(z),
     };
     objectives.evaluate(term, z.device())
 }

@@ -10,7 +10,7 @@ use candle_core::{D, Tensor};
 
 use crate::Result;
 use crate::model::WorldModel;
-use crate::pass::Pass;
+use crate::pass::{Pass, Precision};
 
 pub use cem::{CemConfig, CemIteration, CemPlan, Noise, PlanError, SeededNoise, cem};
 
@@ -35,6 +35,15 @@ pub fn rollout(model: &WorldModel, z: &Tensor, chunks: &Tensor, pass: &Pass) -> 
             chunks.dims()
         );
     }
+    if pass.precision == Precision::F32 && !pass.training && model.roller().takes(z, chunks) {
+        return model.roller().run(z, chunks);
+    }
+    rollout_composed(model, z, chunks, pass)
+}
+
+/// [`rollout`] in composed operations, window by window.
+fn rollout_composed(model: &WorldModel, z: &Tensor, chunks: &Tensor, pass: &Pass) -> Result<Tensor> {
+    let (n_frames, n_chunks) = (z.dim(1)?, chunks.dim(1)?);
     let history = model.architecture().config().predictor.history;
     let c = model.embed_actions(chunks, pass)?.detach(); // [N, H-1+L, D]
     let mut latents: Vec<Tensor> = (0..n_frames).map(|t| z.narrow(1, t, 1)).collect::<Result<_>>()?; // H x [N, 1, D]
@@ -108,4 +117,101 @@ pub fn plan_to_goal(
 fn repeat(x: &Tensor, rows: usize) -> Result<Tensor> {
     let (a, b) = x.dims2()?;
     x.unsqueeze(0)?.broadcast_as((rows, a, b))?.contiguous() // [rows, X, Y]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{DataWidths, ModelConfig};
+    use crate::random::Stream;
+
+    fn normal(name: &str, shape: &[usize]) -> Tensor {
+        let values = Stream::new(1, name, 0).normals(shape.iter().product());
+        Tensor::from_vec(values, shape, &candle_core::Device::Cpu).unwrap()
+    }
+
+    /// A micro model with signal on every path, running statistics included.
+    fn model(change: impl FnOnce(&mut ModelConfig)) -> WorldModel {
+        let mut config = ModelConfig::preset("micro").unwrap();
+        change(&mut config);
+        let architecture = config.resolve(DataWidths { action: 7, state: 0 }).unwrap();
+        let model = WorldModel::new(architecture, 3, &candle_core::Device::Cpu).unwrap();
+        for (name, tensor) in model.parameters().iter() {
+            let noise = (normal(name, tensor.dims()) * 0.3).unwrap();
+            let value = match name {
+                name if name.ends_with("running_var") => (noise.abs().unwrap() + 0.5).unwrap(),
+                name if name.contains("adaLN") || name.ends_with("running_mean") => noise,
+                _ => continue,
+            };
+            model.parameters().set(name, &value).unwrap();
+        }
+        model
+    }
+
+    fn check_rollout(model: &WorldModel, n: usize, frames: usize, chunks: usize) {
+        let (z, actions) = (normal("z", &[n, frames, 16]), normal("actions", &[n, chunks, 7]));
+        let got = rollout(model, &z, &actions, &Pass::eval()).unwrap();
+        let expected = rollout_composed(model, &z, &actions, &Pass::eval()).unwrap();
+        assert_eq!(got.dims(), [n, chunks - frames + 1, 16]);
+        let difference =
+            (got - expected).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+        assert!(difference < 2e-5, "{n} sequences, {frames} frames, {chunks} chunks: {difference}");
+    }
+
+    #[test]
+    fn fused_and_composed_rollouts_agree() {
+        let model = model(|_| {});
+        for (n, frames, chunks) in
+            [(1, 1, 1), (3, 1, 6), (5, 2, 5), (2, 3, 3), (2, 3, 6), (2, 5, 7), (230, 1, 5)]
+        {
+            check_rollout(&model, n, frames, chunks);
+        }
+        let other = self::model(|config| {
+            (config.predictor.history, config.predictor.depth) = (1, 1);
+            (config.predictor.heads, config.predictor.head_width, config.predictor.mlp_width) = (3, 5, 19);
+        });
+        check_rollout(&other, 4, 1, 3);
+        check_rollout(&other, 4, 2, 4);
+        let longer = self::model(|config| (config.predictor.history, config.predictor.depth) = (5, 3));
+        check_rollout(&longer, 4, 2, 8);
+    }
+
+    #[test]
+    fn rollouts_see_changed_parameters() {
+        let model = model(|_| {});
+        check_rollout(&model, 2, 1, 3);
+        for name in
+            ["predictor.pos_embedding", "pred_proj.net.1.running_mean", "action_encoder.embed.0.weight"]
+        {
+            let moved = (model.parameters().get(name).unwrap().copy().unwrap() + 0.25).unwrap();
+            model.parameters().set(name, &moved).unwrap();
+            check_rollout(&model, 2, 1, 3);
+        }
+    }
+
+    #[test]
+    fn a_sequence_does_not_depend_on_its_batch() {
+        let model = model(|_| {});
+        let (z, actions) = (normal("z", &[200, 1, 16]), normal("actions", &[200, 5, 7]));
+        let values = |first, count| {
+            let (z, actions) = (z.narrow(0, first, count).unwrap(), actions.narrow(0, first, count).unwrap());
+            let latents = rollout(&model, &z, &actions, &Pass::eval()).unwrap();
+            latents.flatten_all().unwrap().to_vec1::<f32>().unwrap()
+        };
+        assert_eq!(values(0, 200)[77 * 80..80 * 80], values(77, 3));
+    }
+
+    #[test]
+    fn shapes_that_do_not_fit_are_errors() {
+        let model = model(|_| {});
+        for (z, actions) in [
+            ([2, 1, 16], [3, 1, 7]),
+            ([2, 2, 16], [2, 1, 7]),
+            ([2, 1, 15], [2, 1, 7]),
+            ([2, 1, 16], [2, 1, 6]),
+        ] {
+            let result = rollout(&model, &normal("z", &z), &normal("actions", &actions), &Pass::eval());
+            assert!(result.unwrap_err().to_string().contains("rollout: expected"));
+        }
+    }
 }

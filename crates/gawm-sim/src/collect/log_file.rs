@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use mcap::records::{MessageHeader, Metadata};
 use serde_json::json;
@@ -77,6 +78,7 @@ pub(super) fn write_log(
     path: &Path,
     indices: std::ops::Range<u64>,
     options: &CollectOptions,
+    interrupt: &AtomicBool,
 ) -> Result<LogCounts, CollectError> {
     let partial = path.with_extension("mcap.partial");
     let io = |action, path: &Path, source| CollectError::Io { action, path: path.to_owned(), source };
@@ -85,6 +87,11 @@ pub(super) fn write_log(
     let mut room = TwoRoom::new(options.room.clone())?;
     let mut counts = LogCounts::default();
     for index in indices {
+        if interrupt.load(Ordering::Relaxed) {
+            drop(log);
+            std::fs::remove_file(&partial).map_err(|e| io("remove", &partial, e))?;
+            return Err(CollectError::Interrupted);
+        }
         let episode = Episode::run(&mut room, options.expert, options.max_steps, options.seed, index);
         log.write_episode(&room, &episode)?;
         counts.episodes += 1;
@@ -128,7 +135,7 @@ impl<'a> LogWriter<'a> {
                 .map_err(failed)?;
             *channel = mcap.add_channel(schema, topic, "cdr", &BTreeMap::new()).map_err(failed)?;
         }
-        let images = FrameEncoder::new(options.image, options.image_size.unwrap_or(FRAME_SIZE))?;
+        let images = FrameEncoder::new(options.image, options.image_size.unwrap_or(FRAME_SIZE as u32));
         let mut log = LogWriter {
             path,
             options,
@@ -198,8 +205,8 @@ impl<'a> LogWriter<'a> {
     }
 
     fn write_image(&mut self, stamp_ns: u64) -> Result<(), CollectError> {
-        let encoded = self.images.encode(&self.frame)?;
-        self.cdr.compressed_image(stamp_ns, self.options.image.name(), encoded);
+        let encoded = self.images.encode(&self.frame).map_err(|source| CollectError::Encode { source })?;
+        self.cdr.compressed_image(stamp_ns, self.options.image.name(), &encoded);
         self.write_encoded(IMAGE, stamp_ns)
     }
 

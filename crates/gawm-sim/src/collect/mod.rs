@@ -10,14 +10,16 @@ mod image;
 mod log_file;
 
 pub use episode::Episode;
-pub use image::{EncodeFrameError, ImageFormat};
+pub use image::ImageFormat;
 pub use log_file::{
     ACTION_TOPIC, EPISODE_METADATA, FIRST_ROW_NS, GOAL_TOPIC, IMAGE_TOPIC, MARKER_TOPIC, SESSION_METADATA,
     STATE_TOPIC,
 };
 
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 
+use gawm_image::ImageError;
 use rayon::prelude::*;
 use thiserror::Error;
 
@@ -43,7 +45,7 @@ pub struct CollectOptions {
     /// How frames are stored.
     pub image: ImageFormat,
     /// Side of the stored frames in pixels; `None` for the renderer's own 224.
-    pub image_size: Option<usize>,
+    pub image_size: Option<u32>,
 }
 
 impl Default for CollectOptions {
@@ -130,7 +132,13 @@ pub enum CollectError {
     },
     /// A frame could not be encoded.
     #[error("failed to encode a frame")]
-    Encode(#[from] EncodeFrameError),
+    Encode {
+        /// Why.
+        source: ImageError,
+    },
+    /// The user wanted to stop.
+    #[error("interrupted")]
+    Interrupted,
     /// The configuration could not be written into the log.
     #[error("failed to describe the environment in the log")]
     Describe {
@@ -159,6 +167,19 @@ pub fn collect(
     options: &CollectOptions,
     progress: &(dyn Fn(u64) + Sync),
 ) -> Result<CollectSummary, CollectError> {
+    collect_until(dir, options, progress, &AtomicBool::new(false))
+}
+
+/// Collects as [`collect`] does, until `interrupt` is set: then logs that are complete stay, the others are removed.
+///
+/// # Errors
+/// As [`collect`], and [`CollectError::Interrupted`].
+pub fn collect_until(
+    dir: &Path,
+    options: &CollectOptions,
+    progress: &(dyn Fn(u64) + Sync),
+    interrupt: &AtomicBool,
+) -> Result<CollectSummary, CollectError> {
     check(options)?;
     prepare(dir)?;
     let n_logs = options.episodes.div_ceil(options.episodes_per_file);
@@ -173,7 +194,7 @@ pub fn collect(
                 let first = log * options.episodes_per_file;
                 let end = (first + options.episodes_per_file).min(options.episodes);
                 let path = dir.join(format!("two-room-{first:06}.mcap"));
-                let counts = log_file::write_log(&path, first..end, options)?;
+                let counts = log_file::write_log(&path, first..end, options, interrupt)?;
                 progress(counts.episodes);
                 Ok((path, counts))
             })
@@ -197,7 +218,7 @@ fn check(options: &CollectOptions) -> Result<(), CollectError> {
         ("max_steps", options.max_steps.into()),
         ("episodes_per_file", options.episodes_per_file),
         ("jobs", options.jobs as u64),
-        ("image_size", options.image_size.map_or(1, |size| size as u64)),
+        ("image_size", options.image_size.map_or(1, u64::from)),
     ];
     if let Some((option, _)) = counts.into_iter().find(|(_, count)| *count == 0) {
         return Err(CollectError::Zero { option });

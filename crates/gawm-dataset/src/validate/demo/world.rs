@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use bytes::Bytes;
 
-use crate::picture::Picture;
+use gawm_image::{Limits, Thumbnail, decode_thumbnail, encode_png};
 
 /// Frames per second of the synthetic robot.
 pub(super) const FPS: f64 = 30.0;
@@ -254,23 +254,24 @@ fn frame(camera: usize, state: &[Vec<f64>], t: usize, random: &mut Random) -> By
             rgb.extend([level as u8, (0.8 * level) as u8, (0.6 * level + 20.0) as u8]);
         }
     }
-    encode(&Picture { width: FRAME_SIDE, height: FRAME_SIDE, rgb })
+    encode(&Thumbnail { width: FRAME_SIDE, height: FRAME_SIDE, rgb })
 }
 
 /// Encodes a picture that is known to be sound.
-pub(super) fn encode(picture: &Picture) -> Bytes {
-    Bytes::from(picture.to_png().expect("a buffer of the right size is always encoded"))
+pub(super) fn encode(picture: &Thumbnail) -> Bytes {
+    let image = picture.to_image().expect("a buffer of the right size is an image");
+    Bytes::from(encode_png(&image).expect("an image of 8 bits is always encoded"))
 }
 
 /// Returns a frame of one colour of the usual size times `scale`.
 pub(super) fn flat_frame(level: u8, scale: usize) -> Bytes {
     let side = FRAME_SIDE * scale;
-    encode(&Picture { width: side, height: side, rgb: vec![level; side * side * 3] })
+    encode(&Thumbnail { width: side, height: side, rgb: vec![level; side * side * 3] })
 }
 
 /// Decodes a frame that was made here, changes its bytes and encodes it again.
 pub(super) fn changed_frame(bytes: &Bytes, change: impl Fn(u8) -> u8) -> Bytes {
-    let (_, mut picture) = crate::picture::decode(bytes, 1).expect("frames of the demo decode");
+    let (_, mut picture) = decode_thumbnail(bytes, 1, &Limits::default()).expect("frames of the demo decode");
     picture.rgb.iter_mut().for_each(|v| *v = change(*v));
     encode(&picture)
 }

@@ -60,6 +60,7 @@ pub(crate) fn open_cdr(payload: &[u8]) -> Result<(&[u8], bool), DecodeError> {
         0x000a => "PL_CDR2_BE",
         0x000b => "PL_CDR2_LE",
         0x0004 => "XML",
+        0x7b00..=0x7bff => "JSON text; the channel is labelled wrongly",
         _ => "unknown",
     };
     Err(DecodeError::UnsupportedCdr { id, name })

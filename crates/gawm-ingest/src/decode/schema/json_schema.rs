@@ -23,7 +23,11 @@ pub(crate) fn type_table(name: &str, data: &[u8]) -> Result<TypeTable, String> {
     let schema: Value = serde_json::from_slice(data).map_err(|e| format!("not JSON: {e}"))?;
     let Value::Object(root) = &schema else { return Ok(open()) };
     let mut builder = Builder { root, table: TypeTable::default() };
-    builder.table.structs.push(StructType { name: name.to_owned(), fields: Vec::new() });
+    builder.table.structs.push(StructType {
+        name: name.to_owned(),
+        fields: Vec::new(),
+        ..StructType::default()
+    });
     builder.fill(0, root, 0);
     Ok(builder.table)
 }
@@ -77,7 +81,11 @@ impl<'a> Builder<'a> {
             "string" => (Base::Prim(Prim::Text), Many::One),
             "object" => {
                 let index = self.table.structs.len();
-                self.table.structs.push(StructType { name: name.to_owned(), fields: Vec::new() });
+                self.table.structs.push(StructType {
+                    name: name.to_owned(),
+                    fields: Vec::new(),
+                    ..StructType::default()
+                });
                 self.fill(index, schema, depth);
                 (Base::Struct(index), Many::One)
             }

@@ -2,6 +2,7 @@
 
 pub(crate) mod json_schema;
 pub(crate) mod proto;
+pub(crate) mod ros_idl;
 pub(crate) mod ros_library;
 pub(crate) mod ros_msg;
 
@@ -18,6 +19,18 @@ pub(crate) struct StructType {
     /// Full name, as the schema language writes it.
     pub(crate) name: String,
     pub(crate) fields: Vec<Field>,
+    /// How the type may be extended, where its schema says: of meaning in XCDR2 only.
+    pub(crate) extensibility: Option<Extensibility>,
+    /// Numbers of the fields in mutable types; empty: their positions.
+    pub(crate) member_ids: Vec<u32>,
+}
+
+/// How a type may be extended (DDS-XTypes).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Extensibility {
+    Final,
+    Appendable,
+    Mutable,
 }
 
 #[derive(Clone, Debug)]

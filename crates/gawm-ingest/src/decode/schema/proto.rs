@@ -49,7 +49,11 @@ pub(crate) fn type_table(root: &MessageDescriptor) -> Result<TypeTable, String> 
     let mut known: HashMap<String, usize> = HashMap::new();
     let mut open = vec![root.clone()];
     known.insert(root.full_name().to_owned(), 0);
-    table.structs.push(StructType { name: root.full_name().to_owned(), fields: Vec::new() });
+    table.structs.push(StructType {
+        name: root.full_name().to_owned(),
+        fields: Vec::new(),
+        ..StructType::default()
+    });
     while let Some(message) = open.pop() {
         let mut fields = Vec::new();
         for field in message.fields() {
@@ -58,9 +62,11 @@ pub(crate) fn type_table(root: &MessageDescriptor) -> Result<TypeTable, String> 
                     let next = table.structs.len();
                     let index = *known.entry(inner.full_name().to_owned()).or_insert(next);
                     if index == next {
-                        table
-                            .structs
-                            .push(StructType { name: inner.full_name().to_owned(), fields: Vec::new() });
+                        table.structs.push(StructType {
+                            name: inner.full_name().to_owned(),
+                            fields: Vec::new(),
+                            ..StructType::default()
+                        });
                         open.push(inner);
                     }
                     Base::Struct(index)

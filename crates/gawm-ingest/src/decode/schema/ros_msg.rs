@@ -225,7 +225,7 @@ impl Linker<'_> {
             let base = self.base(name, member, depth)?;
             fields.push(Field { name: member.name.clone(), base, many: member.many, wire: Wire::default() });
         }
-        self.table.structs.push(StructType { name: name.to_owned(), fields });
+        self.table.structs.push(StructType { name: name.to_owned(), fields, ..StructType::default() });
         let index = self.table.structs.len() - 1;
         self.done.insert(name.to_owned(), Some(index));
         Ok(index)

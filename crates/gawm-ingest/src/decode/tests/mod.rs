@@ -3,6 +3,7 @@
 mod cdr;
 mod corpora;
 mod damage;
+mod encodings;
 mod messages;
 
 use std::path::PathBuf;

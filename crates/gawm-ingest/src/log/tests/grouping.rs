@@ -96,8 +96,8 @@ fn what_is_no_recording_is_refused_by_name() {
     check_refused(&[("a_0.db3", "")], |error| {
         matches!(error, OpenLogError::NotMcap { found: Foreign::Sqlite, .. })
     });
-    check_refused(&[("a.mcap.zstd", "")], |error| {
-        matches!(error, OpenLogError::NotMcap { found: Foreign::Compressed { name: "zstd" }, .. })
+    check_refused(&[("a.mcap.gz", "")], |error| {
+        matches!(error, OpenLogError::NotMcap { found: Foreign::Compressed { name: "gzip" }, .. })
     });
     check_refused(&[("metadata.yaml", &bag(&["gone.mcap"])), ("x.mcap", "")], |error| {
         matches!(error, OpenLogError::MissingPart { .. })

@@ -2,10 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use super::super::recording::{EPISODE_GAP_NS, RecordingError, TableRecording};
+use super::super::recording::{RecordingError, TableRecording};
 use super::*;
 use crate::decode::{ChannelSchema, DecodePlan, FieldPath, ImagePlan, RowSink, SchemaLibrary, Value};
 use crate::log::{Channel, DamageKind};
+use crate::rows::{EPISODE_GAP_NS, RowRecording};
 
 fn schema_of(channel: &Channel) -> ChannelSchema<'_> {
     let schema = channel.schema.as_deref().unwrap();
@@ -72,7 +73,7 @@ fn columns_are_topics_and_rows_are_messages() {
 #[test]
 fn images_are_raw_images() {
     let mut recording = TableRecording::try_new(open_fixture("killed.h5"), None, 10.0).unwrap();
-    recording.select(["pixels".to_owned()]);
+    recording.select(&["pixels".to_owned()]);
     let library = SchemaLibrary::builtin();
     let mut n = 0;
     let mut expected = Vec::new();
@@ -144,7 +145,7 @@ fn a_recording_of_the_corpora_passes_the_decoder() {
     let table = open(&path, &Limits::default()).unwrap();
     let proprio = table.read_all("proprio").unwrap().values.to_f64().unwrap();
     let mut recording = TableRecording::try_new(table, None, 10.0).unwrap();
-    recording.select(["proprio".to_owned(), "action".to_owned()]);
+    recording.select(&["proprio".to_owned(), "action".to_owned()]);
     let rows = decode(&recording, "proprio", "data[0:2]");
     assert_eq!(rows.into_iter().flat_map(|(_, v)| v).collect::<Vec<_>>(), proprio);
     assert_eq!(decode(&recording, "action", "data[0:2]").len(), 155 - 4);

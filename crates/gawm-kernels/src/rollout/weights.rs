@@ -1,0 +1,128 @@
+//! The weights of a predictor, in panels.
+
+use super::RolloutShape;
+use crate::gemm::Packed;
+
+/// The parameters of a predictor and what surrounds it, in order; weights of linear layers are [outputs, inputs].
+#[derive(Debug, Clone)]
+pub struct RolloutParameters<'a> {
+    /// Action embedder: weight and bias of its three linear layers (SiLU before the last).
+    pub embedder: [&'a [f32]; 6],
+    /// Position table, [history, latent].
+    pub positions: &'a [f32],
+    /// Of each block: weight and bias of the modulation, of the norm before attention, weight of q, k, v together (no
+    /// bias), weight and bias of the output, of the norm before the MLP, of its expansion and its contraction.
+    pub blocks: Vec<[&'a [f32]; 13]>,
+    /// Weight and bias of the last norm.
+    pub norm: [&'a [f32]; 2],
+    /// Projector: weight and bias of its first layer; weight, bias, mean and variance of the batch norm; weight and bias
+    /// of its last layer.
+    pub projector: [&'a [f32]; 8],
+}
+
+/// A linear layer.
+#[derive(Debug)]
+pub(super) struct Linear {
+    pub(super) weight: Packed,
+    pub(super) bias: Option<Vec<f32>>,
+    pub(super) inputs: usize,
+    pub(super) outputs: usize,
+}
+
+impl Linear {
+    fn new(weight: &[f32], bias: &[f32]) -> Linear {
+        Linear::of(weight, bias.len(), Some(bias.to_vec()))
+    }
+
+    fn of(weight: &[f32], outputs: usize, bias: Option<Vec<f32>>) -> Linear {
+        let inputs = weight.len() / outputs;
+        assert_eq!(weight.len(), inputs * outputs, "rollout: size of a weight");
+        Linear { weight: Packed::of_transposed(weight, [outputs, inputs]), bias, inputs, outputs }
+    }
+}
+
+/// Weight and bias of a norm.
+#[derive(Debug)]
+pub(super) struct Norm {
+    pub(super) weight: Vec<f32>,
+    pub(super) bias: Vec<f32>,
+}
+
+impl Norm {
+    fn new(weight: &[f32], bias: &[f32]) -> Norm {
+        Norm { weight: weight.to_vec(), bias: bias.to_vec() }
+    }
+}
+
+#[derive(Debug)]
+pub(super) struct Block {
+    pub(super) modulation: Linear,
+    pub(super) attn_norm: Norm,
+    pub(super) q: Linear,
+    pub(super) k: Linear,
+    pub(super) v: Linear,
+    pub(super) output: Linear,
+    pub(super) mlp_norm: Norm,
+    pub(super) expand: Linear,
+    pub(super) contract: Linear,
+}
+
+#[derive(Debug)]
+pub(super) struct Packs {
+    pub(super) embedder: [Linear; 3],
+    pub(super) positions: Vec<f32>,
+    pub(super) blocks: Vec<Block>,
+    pub(super) norm: Norm,
+    /// The first layer, with the batch norm of running statistics folded in: `w' = w s`, `b' = (b - mean) s + shift`,
+    /// `s = scale / sqrt(var + epsilon)`.
+    pub(super) project: Linear,
+    pub(super) finish: Linear,
+}
+
+impl Packs {
+    pub(super) fn new(shape: &RolloutShape, parameters: &RolloutParameters<'_>) -> Packs {
+        let inner = shape.heads * shape.head_width;
+        let [a, a_bias, b, b_bias, c, c_bias] = parameters.embedder;
+        let block = |parameters: &[&[f32]; 13]| {
+            let [ada, ada_bias, norm1, bias1, qkv, out, out_bias, norm2, bias2, up, up_bias, down, down_bias] =
+                *parameters;
+            let part = |index: usize| {
+                let size = inner * shape.latent;
+                Linear::of(&qkv[index * size..(index + 1) * size], inner, None)
+            };
+            Block {
+                modulation: Linear::new(ada, ada_bias),
+                attn_norm: Norm::new(norm1, bias1),
+                q: part(0),
+                k: part(1),
+                v: part(2),
+                output: Linear::new(out, out_bias),
+                mlp_norm: Norm::new(norm2, bias2),
+                expand: Linear::new(up, up_bias),
+                contract: Linear::new(down, down_bias),
+            }
+        };
+        let [first, first_bias, scale, shift, mean, variance, last, last_bias] = parameters.projector;
+        let factors: Vec<f32> = (scale.iter().zip(variance))
+            .map(|(scale, variance)| scale / (variance + shape.batch_epsilon).sqrt())
+            .collect();
+        let rows = first.chunks_exact(shape.latent).zip(&factors);
+        let folded: Vec<f32> = rows.flat_map(|(row, factor)| row.iter().map(move |w| w * factor)).collect();
+        let centred = first_bias.iter().zip(mean).map(|(bias, mean)| bias - mean);
+        let folded_bias: Vec<f32> =
+            centred.zip(&factors).zip(shift).map(|((bias, factor), shift)| bias * factor + shift).collect();
+        assert_eq!(
+            parameters.positions.len(),
+            shape.history * shape.latent,
+            "rollout: size of the positions"
+        );
+        Packs {
+            embedder: [Linear::new(a, a_bias), Linear::new(b, b_bias), Linear::new(c, c_bias)],
+            positions: parameters.positions.to_vec(),
+            blocks: parameters.blocks.iter().map(block).collect(),
+            norm: Norm::new(parameters.norm[0], parameters.norm[1]),
+            project: Linear::new(&folded, &folded_bias),
+            finish: Linear::new(last, last_bias),
+        }
+    }
+}

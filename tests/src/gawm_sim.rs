@@ -1,0 +1,8 @@
+//! `gawm-sim` as its own `main` starts it.
+#![forbid(unsafe_code)]
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    gawm_sim::cli::main(std::env::args_os())
+}
