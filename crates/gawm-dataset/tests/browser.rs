@@ -1,5 +1,7 @@
 //! Pages in a real browser: nothing is loaded, nothing is reported on the console, the table sorts.
 
+#![expect(clippy::unwrap_used, reason = "a test stops where its set-up fails")]
+
 use std::fs;
 use std::path::Path;
 use std::process::Command;

@@ -1,5 +1,7 @@
 //! Statistics against numpy: `golden/statistics.json` was computed by `xtask/interop/statistics_oracle.py`.
 
+#![expect(clippy::unwrap_used, reason = "a test stops where its set-up fails")]
+
 use std::collections::BTreeMap;
 
 use gawm_dataset::read::{Dataset, ReadLimits};

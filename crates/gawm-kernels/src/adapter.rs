@@ -6,6 +6,7 @@
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::ThreadId;
 
 use candle_core::{CpuStorage, CustomOp2, DType, Device, Layout, Result, Shape, Storage, Tensor, TensorId};
 
@@ -18,7 +19,14 @@ use crate::vit::{Images, Vit, VitShape, VitState};
 pub struct GradientSink {
     /// Held while a backward pass runs.
     turn: Arc<Mutex<()>>,
-    gradients: Arc<Mutex<Option<HashMap<TensorId, Tensor>>>>,
+    collection: Arc<Mutex<Option<Collection>>>,
+}
+
+/// Gradients of a backward pass that runs on one thread.
+#[derive(Debug)]
+struct Collection {
+    thread: ThreadId,
+    gradients: HashMap<TensorId, Tensor>,
 }
 
 impl GradientSink {
@@ -27,10 +35,17 @@ impl GradientSink {
     /// Backward passes over one sink take turns.
     pub fn collect<T>(&self, backward: impl FnOnce() -> Result<T>) -> Result<(T, HashMap<TensorId, Tensor>)> {
         let _turn = lock(&self.turn);
-        *lock(&self.gradients) = Some(HashMap::new());
+        let thread = std::thread::current().id();
+        *lock(&self.collection) = Some(Collection { thread, gradients: HashMap::new() });
         let result = backward();
-        let gradients = lock(&self.gradients).take().unwrap_or_default();
-        Ok((result?, gradients))
+        let collection = lock(&self.collection).take();
+        Ok((result?, collection.map(|collection| collection.gradients).unwrap_or_default()))
+    }
+
+    /// Whether the backward pass of this thread is collected.
+    pub(crate) fn collects(&self) -> bool {
+        let thread = std::thread::current().id();
+        lock(&self.collection).as_ref().is_some_and(|collection| collection.thread == thread)
     }
 
     /// Adds a gradient. Shape as the parameter's.
@@ -38,9 +53,10 @@ impl GradientSink {
     /// # Errors
     ///
     /// - if nobody collects: the gradient would be lost.
-    fn put(&self, parameter: &Tensor, gradient: Tensor) -> Result<()> {
-        let mut gradients = lock(&self.gradients);
-        let Some(gradients) = gradients.as_mut() else {
+    pub(crate) fn put(&self, parameter: &Tensor, gradient: Tensor) -> Result<()> {
+        let thread = std::thread::current().id();
+        let mut collection = lock(&self.collection);
+        let Some(Collection { gradients, .. }) = collection.as_mut().filter(|c| c.thread == thread) else {
             candle_core::bail!(
                 "backward pass through the encoder: expected a collector of its gradients, got none (detach the latents, or use Gradients::of)"
             );

@@ -83,6 +83,8 @@ impl Packed {
                     out[..columns].copy_from_slice(&values[start..start + columns]);
                     out[columns..].fill(0.0);
                 }
+            } else if k_stride == 1 {
+                transpose(&values[first * n_stride..], n_stride, [columns, k], out, width);
             } else {
                 for column in 0..columns {
                     let source = values[(first + column) * n_stride..].iter().step_by(k_stride);
@@ -114,6 +116,34 @@ impl Packed {
     /// Number of columns, without the zeros of the last panel.
     pub fn columns(&self) -> usize {
         self.n
+    }
+}
+
+/// Writes the transpose of `rows` x `k` values, whose rows are `stride` apart, to rows of `width` elements; those beyond
+/// `rows` become zero.
+fn transpose(values: &[f32], stride: usize, [rows, k]: [usize; 2], out: &mut [f32], width: usize) {
+    let whole = rows - rows % 4;
+    for first in (0..whole).step_by(4) {
+        let row = |index: usize| values[(first + index) * stride..][..k].chunks_exact(4);
+        let tiles = row(0).zip(row(1)).zip(row(2)).zip(row(3));
+        for ((((a, b), c), d), out) in tiles.zip(out.chunks_exact_mut(4 * width)) {
+            // Four by four, which becomes shuffles of registers.
+            for lane in 0..4 {
+                let target = &mut out[lane * width + first..][..4];
+                target.copy_from_slice(&[a[lane], b[lane], c[lane], d[lane]]);
+            }
+        }
+        for kk in k - k % 4..k {
+            for index in 0..4 {
+                out[kk * width + first + index] = values[(first + index) * stride + kk];
+            }
+        }
+    }
+    for (kk, out) in out.chunks_exact_mut(width).enumerate() {
+        for (index, out) in out[whole..rows].iter_mut().enumerate() {
+            *out = values[(whole + index) * stride + kk];
+        }
+        out[rows..].fill(0.0);
     }
 }
 

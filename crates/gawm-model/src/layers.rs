@@ -2,19 +2,21 @@
 //!
 //! candle's own `layer_norm`, `softmax_last_dim` and `Tensor::gelu` are fast and wrong for us: the first two have no
 //! backward pass and end the gradient without an error, the third is the tanh approximation. A test compares every
-//! function here with finite differences.
+//! function here with finite differences. Linear layers go through `gawm-kernels` where it takes them.
 
 use candle_core::{D, DType, Device, Tensor, Var};
+use gawm_kernels::GradientSink;
 
 use crate::Result;
 use crate::parameters::{Init, Parameters, Specs, buffer, weight};
-use crate::pass::Pass;
+use crate::pass::{Pass, Precision};
 
 /// `y = x W^T + b`.
 #[derive(Debug, Clone)]
 pub struct Linear {
     weight: Tensor,
     bias: Option<Tensor>,
+    sink: GradientSink,
 }
 
 impl Linear {
@@ -35,12 +37,13 @@ impl Linear {
     pub fn load(parameters: &Parameters, name: &str) -> Result<Linear> {
         let bias = format!("{name}.bias");
         let bias = if parameters.specs().contains_key(&bias) { Some(parameters.get(&bias)?) } else { None };
-        Ok(Linear { weight: parameters.get(&format!("{name}.weight"))?, bias })
+        let weight = parameters.get(&format!("{name}.weight"))?;
+        Ok(Linear { weight, bias, sink: parameters.sink().clone() })
     }
 
     /// Makes a layer of a weight [outputs, inputs] and a bias `[outputs]`.
     pub fn new(weight: Tensor, bias: Option<Tensor>) -> Linear {
-        Linear { weight, bias }
+        Linear { weight, bias, sink: GradientSink::default() }
     }
 
     /// Width of the results.
@@ -56,9 +59,14 @@ impl Linear {
         if let Some(last) = dims.last_mut() {
             *last = outputs;
         }
+        let x = x.reshape((rows, inputs))?;
+        let bias = self.bias.as_ref();
+        if pass.precision == Precision::F32 && gawm_kernels::linear::takes(&x, &self.weight, bias) {
+            return gawm_kernels::linear::linear(&x, &self.weight, bias, &self.sink)?.reshape(dims); // [.., outputs]
+        }
         // One product over all rows: candle would copy the weight for every leading index otherwise.
-        let y = pass.matmul(&x.reshape((rows, inputs))?, &self.weight.t()?)?; // [rows, outputs]
-        let y = match &self.bias {
+        let y = pass.matmul(&x, &self.weight.t()?)?; // [rows, outputs]
+        let y = match bias {
             Some(bias) => y.broadcast_add(bias)?,
             None => y,
         };

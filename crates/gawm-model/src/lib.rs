@@ -29,8 +29,9 @@
 //!
 //! candle's fused layer norm, softmax and rotary have no backward pass and *silently* end the gradient; its `gelu` is the
 //! tanh form; its random numbers on the CPU cannot be seeded; its AdamW neither clips nor shows its state. Everything of
-//! that kind is therefore in this crate, in plain operations (`docs/model.md` lists them). Speed comes from kernels that
-//! replace single functions of [`layers`] and must agree with them.
+//! that kind is therefore in this crate, in plain operations (`docs/model.md` lists them). Speed comes from
+//! `gawm-kernels`, which stands in for the encoder, linear layers, the roll-out of a plan and the optimiser on CPUs in f32
+//! and must agree with the plain operations.
 //!
 //! **Invariant**: a forward pass is a function of parameters, inputs and a [`Pass`]; nothing else decides a number.
 //!

@@ -171,7 +171,9 @@ impl Trainer {
                     self.state.steps = id.step + 1;
                     self.state.resume_at = n;
                     self.output.step(id, &step)?;
-                    if self.state.steps.is_multiple_of(self.config.train.checkpoint_every) {
+                    // The last step and a validation save by themselves.
+                    let is_due = self.state.steps.is_multiple_of(self.config.train.checkpoint_every);
+                    if is_due && n < sequence.batches() {
                         self.save_last()?;
                     }
                 }
@@ -232,7 +234,10 @@ impl Trainer {
         if is_best {
             self.save(&self.folder.best(), "best")?;
         }
-        self.save_last()
+        match self.state.resume_at < self.hello.sequence.batches() {
+            true => self.save_last(),
+            false => Ok(()), // the end of the run saves
+        }
     }
 
     fn stop(&mut self) -> Result<Outcome, TrainError> {

@@ -10,7 +10,8 @@ use std::process::ExitCode;
 
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 
-use crate::pipeline::{Pipeline, PipelineError, RunError, RunOptions, StepName, pass_interrupts_on, run};
+use crate::pipeline::{Outcome, Pipeline, PipelineError, RunError, RunOptions, StepName, pass_interrupts_on, run};
+use crate::quickstart::{self, QuickstartError};
 
 /// Raw robot and simulator logs to trajectories, world models, plans and honest numbers
 #[derive(Debug, Parser)]
@@ -37,10 +38,16 @@ enum Verb {
     Data(Rest),
     /// Clips from datasets into shared memory: run, bench, clean (gawm-loader)
     Loader(Rest),
+    /// Train a world model on what loaders send (gawm-train)
+    Train(Rest),
+    /// Plan with a model, and examine it (gawm-eval)
+    Eval(Rest),
     /// Environments: collect logs of an expert (gawm-sim)
     Sim(Rest),
     /// Run a pipeline: the steps from logs to a report that are not up to date
     Run(RunArgs),
+    /// Make logs, a dataset, a model and plans from nothing, and one page about them
+    Quickstart(QuickstartArgs),
     /// Print a completion script for a shell
     Completions {
         /// The shell
@@ -81,6 +88,22 @@ struct RunArgs {
     print_config: bool,
 }
 
+/// Arguments of `quickstart`.
+#[derive(Debug, Args)]
+#[command(after_long_help = "Look at DIR/report.html; DIR/summary.json has the numbers.
+Run again, it does only what is not up to date.")]
+struct QuickstartArgs {
+    /// Folder of all results
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Override a value of the pipeline, such as train.seed=2
+    #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
+    set: Vec<String>,
+    /// Print the pipeline with overrides, and do nothing
+    #[arg(long)]
+    print_config: bool,
+}
+
 /// Runs the program with its arguments, the first being its name, and returns its exit code.
 ///
 /// Called as `gawm-data`, `gawm-ingest` and so on (a link by that name), it is that program.
@@ -102,8 +125,11 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
         Verb::Ingest(rest) => gawm_ingest::cli::main(named("gawm ingest", rest)),
         Verb::Data(rest) => gawm_dataset::cli::run(named("gawm data", rest)),
         Verb::Loader(rest) => gawm_loader::cli::main(named("gawm loader", rest)),
+        Verb::Train(rest) => gawm_train::cli::run(named("gawm train", rest), gawm_train::loaders::LoaderProgram::Itself),
+        Verb::Eval(rest) => gawm_eval::cli::main(named("gawm eval", rest)),
         Verb::Sim(rest) => gawm_sim::cli::main(named("gawm sim", rest)),
         Verb::Run(arguments) => run_pipeline(&arguments),
+        Verb::Quickstart(arguments) => run_quickstart(&arguments),
         Verb::Completions { shell } => {
             clap_complete::generate(shell, &mut Cli::command(), "gawm", &mut std::io::stdout());
             ExitCode::SUCCESS
@@ -123,31 +149,16 @@ fn named(name: &str, rest: Rest) -> Vec<OsString> {
 }
 
 fn run_pipeline(arguments: &RunArgs) -> ExitCode {
-    let result = try_run_pipeline(arguments);
-    match result {
-        Ok(code) => code,
-        Err(error) => {
-            let mut stderr = std::io::stderr().lock();
-            let (code, hint) = advice(&error);
-            // Nothing can be done when stderr is closed.
-            writeln!(stderr, "error: {:#}", anyhow::Error::new(error)).ok();
-            if let Some(hint) = hint {
-                writeln!(stderr, "\nhint: {hint}").ok();
-            }
-            ExitCode::from(code)
-        }
-    }
+    try_run_pipeline(arguments).unwrap_or_else(fail)
 }
 
 fn try_run_pipeline(arguments: &RunArgs) -> Result<ExitCode, RunError> {
     let pipeline = Pipeline::load(&arguments.pipeline, &arguments.set)?;
     if arguments.print_config {
-        print!("{}", pipeline.text_of(&crate::pipeline::SECTIONS));
+        print(&pipeline.text_of(&crate::pipeline::SECTIONS));
         return Ok(ExitCode::SUCCESS);
     }
-    let program = std::env::current_exe().map_err(|source| RunError::Start { name: "gawm", source })?;
-    pass_interrupts_on()
-        .map_err(|error| RunError::Start { name: "gawm", source: std::io::Error::other(error) })?;
+    let program = prepare()?;
     let options = RunOptions {
         out: &arguments.out,
         logs: &arguments.logs,
@@ -157,8 +168,76 @@ fn try_run_pipeline(arguments: &RunArgs) -> Result<ExitCode, RunError> {
         program: &program,
     };
     let outcome = run(&pipeline, &options, &mut |line| eprintln!("{line}"))?;
-    let has_warning = outcome.steps.iter().any(|step| step.exit != 0);
-    Ok(if has_warning { ExitCode::from(3) } else { ExitCode::SUCCESS })
+    Ok(exit_of(&outcome))
+}
+
+fn run_quickstart(arguments: &QuickstartArgs) -> ExitCode {
+    match try_run_quickstart(arguments) {
+        Ok(code) => code,
+        Err(QuickstartError::Run(error)) => fail(error),
+        Err(error) => {
+            eprintln!("error: {:#}", anyhow::Error::new(error));
+            eprintln!("\nhint: `--out` of another folder begins anew");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn try_run_quickstart(arguments: &QuickstartArgs) -> Result<ExitCode, QuickstartError> {
+    if arguments.print_config {
+        let path = Path::new("quickstart");
+        let pipeline = Pipeline::parse(path, quickstart::PIPELINE, &arguments.set).map_err(RunError::Pipeline)?;
+        print(&pipeline.text_of(&crate::pipeline::SECTIONS));
+        return Ok(ExitCode::SUCCESS);
+    }
+    let program = prepare()?;
+    let done = quickstart::quickstart(&arguments.out, &arguments.set, &program, &mut |line| eprintln!("{line}"))?;
+    let summary = &done.summary;
+    let percent = |fraction: f64| 100.0 * fraction;
+    print(&format!(
+        "success      {:5.1} %   on problems whose start is no solution (nothing {:.1}, random {:.1}, straight line {:.1})\n\
+         wall success {:5.1} %   on problems that need the door (search blind for the wall {:.1})\n\
+         problems     {:5}\n\
+         seconds      {:7.1}\n\n{}\n\nreport: {}\n",
+        percent(summary.success),
+        percent(summary.floor_noop),
+        percent(summary.floor_random),
+        percent(summary.floor_straight),
+        percent(summary.wall_success),
+        percent(summary.wall_floor_blind),
+        summary.problems,
+        summary.seconds,
+        summary.verdict,
+        done.report.display()
+    ));
+    Ok(exit_of(&done.outcome))
+}
+
+/// Returns this program, and makes it pass Ctrl-C on to its steps.
+fn prepare() -> Result<PathBuf, RunError> {
+    let start = |source| RunError::Start { name: "gawm", source };
+    pass_interrupts_on().map_err(|error| start(std::io::Error::other(error)))?;
+    std::env::current_exe().map_err(start)
+}
+
+fn exit_of(outcome: &Outcome) -> ExitCode {
+    if outcome.steps.iter().any(|step| step.exit != 0) { ExitCode::from(3) } else { ExitCode::SUCCESS }
+}
+
+/// Writes a result to stdout; a reader that has gone away (`| head`) is no error.
+fn print(text: &str) {
+    std::io::stdout().lock().write_all(text.as_bytes()).ok();
+}
+
+fn fail(error: RunError) -> ExitCode {
+    let mut stderr = std::io::stderr().lock();
+    let (code, hint) = advice(&error);
+    // Nothing can be done when stderr is closed.
+    writeln!(stderr, "error: {:#}", anyhow::Error::new(error)).ok();
+    if let Some(hint) = hint {
+        writeln!(stderr, "\nhint: {hint}").ok();
+    }
+    ExitCode::from(code)
 }
 
 fn advice(error: &RunError) -> (u8, Option<String>) {

@@ -2,7 +2,8 @@
 //!
 //! `gawm <verb> ...` is `gawm-<verb> ...`: [`cli`] hands the rest of the line to the `cli` module of that crate. A
 //! [`pipeline::Pipeline`] is one TOML file whose sections name the steps from logs to a report; [`pipeline::run`] runs
-//! the steps that are not up to date, each as a process of this same binary.
+//! the steps that are not up to date, each as a process of this same binary. [`quickstart::quickstart`] is such a pipeline with a
+//! report at its end.
 //!
 //! # Decision: steps are processes
 //!
@@ -14,3 +15,4 @@
 
 pub mod cli;
 pub mod pipeline;
+pub mod quickstart;

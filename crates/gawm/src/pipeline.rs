@@ -11,6 +11,7 @@ pub use ledger::{Ledger, LedgerEntry, LedgerError};
 pub(crate) use run::pass_interrupts_on;
 pub use run::{Outcome, RunError, RunOptions, StepReport, run};
 pub use sim::SimSection;
+pub(crate) use steps::Layout;
 pub use steps::{Step, StepName, plan_steps};
 
 /// Sections a pipeline may have, in the order of the steps that read them.

@@ -73,7 +73,14 @@ fn edit(folder: &Path, dataset: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let text = |path: &Path| path.display().to_string();
     let (source, parts) = (text(dataset), path("parts"));
     let mut written = vec![path("filtered"), path("trimmed")];
-    gawm_data(&["filter", &source, "--out", &text(&written[0]), "--where", "length > 1 and episode_index < 1000"])?;
+    gawm_data(&[
+        "filter",
+        &source,
+        "--out",
+        &text(&written[0]),
+        "--where",
+        "length > 1 and episode_index < 1000",
+    ])?;
     gawm_data(&["trim", &source, "--out", &text(&written[1])])?;
     let n_episodes = episodes(dataset)?;
     if n_episodes > 1 {

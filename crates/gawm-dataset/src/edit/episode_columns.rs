@@ -107,8 +107,8 @@ fn array_of(values: &[&Value]) -> ArrayRef {
     if !known.is_empty() && known.iter().all(|v| v.is_number()) {
         return Arc::new(values.iter().map(|v| v.as_f64()).collect::<Float64Array>());
     }
-    let is_texts = |v: &&&Value| v.as_array().is_some_and(|list| list.iter().all(Value::is_string));
-    if known.len() == values.len() && !known.is_empty() && known.iter().all(|v| is_texts(&v)) {
+    let is_texts = |v: &&Value| v.as_array().is_some_and(|list| list.iter().all(Value::is_string));
+    if known.len() == values.len() && !known.is_empty() && known.iter().all(|v| is_texts(v)) {
         let lists: Vec<Vec<String>> = known
             .iter()
             .map(|v| {

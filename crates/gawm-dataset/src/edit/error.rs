@@ -139,7 +139,7 @@ impl EditError {
             EditError::Video { .. } => {
                 Some("copy the videos again, or leave cameras out: --without-camera NAME, --without-videos")
             }
-            EditError::Write(error) if matches!(error, WriteError::DiskFull { .. }) => {
+            EditError::Write(WriteError::DiskFull { .. }) => {
                 Some("free some space and run again; nothing was left at the output's place")
             }
             _ => None,

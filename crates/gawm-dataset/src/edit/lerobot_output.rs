@@ -340,16 +340,12 @@ impl<'a> RowWriter<'a> {
     fn close(&mut self) -> Result<(), EditError> {
         let Some((mut writer, path)) = self.file.take() else { return Ok(()) };
         self.n_files += 1;
-        let finish = || {
+        let mut finish = || -> Result<(), parquet::errors::ParquetError> {
             writer.finish()?;
             writer.sync()?;
-            Ok(writer.inner().sync()?)
+            Ok(writer.inner_mut().sync()?)
         };
-        let finished: Result<(), parquet::errors::ParquetError> = {
-            let mut finish = finish;
-            finish()
-        };
-        finished.map_err(WriteError::parquet(&path))?;
+        finish().map_err(WriteError::parquet(&path))?;
         sync_parent(&path).map_err(EditError::io("sync", &path))
     }
 }

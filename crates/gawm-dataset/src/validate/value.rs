@@ -145,9 +145,17 @@ impl Judge<'_> {
                 "the value is {} in all {} rows; it moves in {moving} of {n_runs} episodes",
                 signal.min, run.n_rows
             );
-            findings
-                .push(self.finding("SEMANTIC-004", dim, message).episode(run.episode).rows(0, run.n_rows));
+            let finding = self.finding("SEMANTIC-004", dim, message).episode(run.episode).rows(0, run.n_rows);
+            let is_at_zero = signal.min == 0.0 && self.rests_at_zero(dim);
+            findings.push(if is_at_zero { finding.at(Severity::Info) } else { finding });
         }
+    }
+
+    /// Returns whether the dim is never negative and touches zero in most episodes, as a force without contact does.
+    fn rests_at_zero(&self, dim: usize) -> bool {
+        let n_zero = self.signals(dim).filter(|(_, s)| !s.is_constant() && s.min == 0.0).count();
+        let n_moving = self.signals(dim).filter(|(_, s)| !s.is_constant()).count();
+        2 * n_zero > n_moving && self.signals(dim).all(|(_, s)| s.n_finite == 0 || s.min >= 0.0)
     }
 
     fn stuck(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
@@ -189,7 +197,9 @@ impl Judge<'_> {
                 };
                 let finding =
                     self.finding("VALUE-003", dim, message).episode(run.episode).rows(rest.start, rest.end());
-                findings.push(finding.measured(rest.n_rows as f64, bounds.stuck_ratio * usual));
+                let finding = finding.measured(rest.n_rows as f64, bounds.stuck_ratio * usual);
+                let is_at_zero = signal.median == 0.0 && self.rests_at_zero(dim);
+                findings.push(if is_at_zero { finding.at(Severity::Info) } else { finding });
             }
         }
     }
@@ -369,7 +379,8 @@ impl Judge<'_> {
 
     fn offset(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
         let bounds = &self.thresholds.value;
-        if matches!(kind, DimKind::Rotation | DimKind::Bool) || self.profiles.len() < 6 {
+        // A gripper is open in one episode and closed in another.
+        if matches!(kind, DimKind::Rotation | DimKind::Bool | DimKind::Gripper) || self.profiles.len() < 6 {
             return;
         }
         let centres: Vec<f64> = self.signals(dim).map(|(_, s)| s.median).collect();

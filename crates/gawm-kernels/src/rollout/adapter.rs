@@ -32,7 +32,14 @@ pub struct Roller {
     shape: RolloutShape,
     tensors: Arc<Vec<Tensor>>,
     n_blocks: usize,
-    ready: Arc<Mutex<Option<(u64, Arc<Rollout>)>>>,
+    ready: Arc<Mutex<Option<Ready>>>,
+}
+
+/// Arranged weights, and the fingerprint of the values that they were made of.
+#[derive(Debug)]
+struct Ready {
+    fingerprint: u64,
+    rollout: Arc<Rollout>,
 }
 
 impl Roller {
@@ -87,13 +94,11 @@ impl Roller {
         with_values(&self.tensors, |values| {
             let present = fingerprint(values);
             let mut ready = self.ready.lock().unwrap_or_else(PoisonError::into_inner);
-            if let Some((of, rollout)) = &*ready
-                && *of == present
-            {
-                return Ok(Arc::clone(rollout));
+            if let Some(ready) = ready.as_ref().filter(|ready| ready.fingerprint == present) {
+                return Ok(Arc::clone(&ready.rollout));
             }
             let rollout = Arc::new(Rollout::new(self.shape, &parameters(values)));
-            *ready = Some((present, Arc::clone(&rollout)));
+            *ready = Some(Ready { fingerprint: present, rollout: Arc::clone(&rollout) });
             Ok(rollout)
         })
     }

@@ -3,6 +3,7 @@
 
 mod attention;
 mod gemm;
+mod linear;
 mod pointwise;
 mod reference;
 mod vit;

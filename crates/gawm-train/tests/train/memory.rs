@@ -172,11 +172,11 @@ fn fill(shape: &BatchShape, n: u64, sections: &mut SectionsMut<'_>) {
                     frame[(y * shape.width + x) * 3] = 255;
                 }
             }
-            for axis in 0..2 {
-                sections.states[row * 2 + axis] = ((place[axis] - 8.0) / 3.0) as f32;
+            for (axis, place) in place.iter_mut().enumerate() {
+                sections.states[row * 2 + axis] = ((*place - 8.0) / 3.0) as f32;
                 let velocity = 4.0 * stream.uniform() - 2.0;
                 sections.actions[row * 2 + axis] = (velocity / 1.2) as f32;
-                place[axis] = (place[axis] + velocity).clamp(1.0, SIDE as f64 - 2.0);
+                *place = (*place + velocity).clamp(1.0, SIDE as f64 - 2.0);
             }
         }
     }

@@ -60,19 +60,21 @@ pub struct Step {
 
 /// Where a pipeline puts what it makes.
 #[derive(Debug, Clone)]
-pub(super) struct Layout {
-    pub(super) config: PathBuf,
-    pub(super) logs: PathBuf,
-    pub(super) dataset: PathBuf,
-    pub(super) ingest_report: PathBuf,
-    pub(super) validation: PathBuf,
-    pub(super) page: PathBuf,
-    pub(super) run: PathBuf,
-    pub(super) ledger: PathBuf,
+pub(crate) struct Layout {
+    pub(crate) config: PathBuf,
+    pub(crate) logs: PathBuf,
+    pub(crate) dataset: PathBuf,
+    pub(crate) ingest_report: PathBuf,
+    pub(crate) validation: PathBuf,
+    pub(crate) page: PathBuf,
+    pub(crate) run: PathBuf,
+    pub(crate) plan: PathBuf,
+    pub(crate) diagnosis: PathBuf,
+    pub(crate) ledger: PathBuf,
 }
 
 impl Layout {
-    pub(super) fn of(out: &Path) -> Layout {
+    pub(crate) fn of(out: &Path) -> Layout {
         Layout {
             config: out.join("pipeline.toml"),
             logs: out.join("logs"),
@@ -81,6 +83,8 @@ impl Layout {
             validation: out.join("validation.json"),
             page: out.join("dataset.html"),
             run: out.join("run"),
+            plan: out.join("plan"),
+            diagnosis: out.join("diagnose"),
             ledger: out.join("pipeline.json"),
         }
     }
@@ -135,6 +139,11 @@ pub fn plan_steps(pipeline: &Pipeline, out: &Path, logs: &[PathBuf]) -> Result<V
         }
         key.add(&pipeline.text_of(&["loader", "model", "objectives", "train"]));
         steps.push(train(&layout, key.digest()));
+        if let Some(eval) = pipeline.document.get("eval") {
+            key.add(&pipeline.text_of(&["eval"]));
+            steps.extend(eval.get("plan").map(|_| plan(&layout, key.digest())));
+            steps.push(diagnose(&layout, key.digest()));
+        }
     }
     Ok(steps)
 }
@@ -192,6 +201,21 @@ fn train(layout: &Layout, key: String) -> Step {
         stdout: None,
         key,
     }
+}
+
+fn plan(layout: &Layout, key: String) -> Step {
+    evaluate(layout, StepName::Plan, "plan", "model and floors on the same problems", &layout.plan, key)
+}
+
+fn diagnose(layout: &Layout, key: String) -> Step {
+    evaluate(layout, StepName::Diagnose, "diagnose", "what the latents hold", &layout.diagnosis, key)
+}
+
+fn evaluate(layout: &Layout, name: StepName, verb: &str, what: &str, output: &Path, key: String) -> Step {
+    let mut arguments: Vec<OsString> = vec!["eval".into(), verb.into(), layout.run.clone().into()];
+    arguments.extend(["--config".into(), layout.config.clone().into()]);
+    arguments.extend(["--data".into(), layout.dataset.clone().into(), "--out".into(), output.into()]);
+    Step { name, what: what.to_owned(), arguments, resume: None, output: output.to_owned(), stdout: None, key }
 }
 
 /// A hash that grows with what is read, step by step: the key of a step covers all steps before it.
