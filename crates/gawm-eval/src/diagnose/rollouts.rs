@@ -12,7 +12,7 @@ use crate::run::Run;
 /// Starts that are rolled out at once.
 const STARTS_PER_BLOCK: usize = 128;
 /// Most starts over all trajectories; beyond it they are thinned out evenly.
-const MAX_STARTS: usize = 8192;
+const MAX_STARTS: usize = 1024;
 
 /// Prediction error after a number of chunks.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
