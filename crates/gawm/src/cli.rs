@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
+use gawm_train::loaders::LoaderProgram;
 
 use crate::pipeline::{Outcome, Pipeline, PipelineError, RunError, RunOptions, StepName, pass_interrupts_on, run};
 use crate::quickstart::{self, QuickstartError};
@@ -125,7 +126,9 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
         Verb::Ingest(rest) => gawm_ingest::cli::main(named("gawm ingest", rest)),
         Verb::Data(rest) => gawm_dataset::cli::run(named("gawm data", rest)),
         Verb::Loader(rest) => gawm_loader::cli::main(named("gawm loader", rest)),
-        Verb::Train(rest) => gawm_train::cli::run(named("gawm train", rest), gawm_train::loaders::LoaderProgram::Itself),
+        Verb::Train(rest) => {
+            gawm_train::cli::run(named("gawm train", rest), LoaderProgram::Itself(vec!["loader".into()]))
+        }
         Verb::Eval(rest) => gawm_eval::cli::main(named("gawm eval", rest)),
         Verb::Sim(rest) => gawm_sim::cli::main(named("gawm sim", rest)),
         Verb::Run(arguments) => run_pipeline(&arguments),

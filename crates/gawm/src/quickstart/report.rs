@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use gawm_eval::figures::{Line, Page, lines, plan_page};
-use gawm_eval::suite::PlanReport;
+use gawm_eval::suite::{PlanReport, Solver};
 use serde_json::Value;
 
 use super::{QuickstartError, Summary, read, read_json};
@@ -34,7 +34,7 @@ pub(super) fn page(
     for set in &plan.sets {
         let path = layout.plan.join(format!("sheet-{}.png", set.name));
         if path.exists() {
-            sheets.push((set.name.clone(), read(&path)?));
+            sheets.push((set.name.clone(), Solver::Model, read(&path)?));
         }
     }
     page.append(&plan_page(plan, &sheets));
