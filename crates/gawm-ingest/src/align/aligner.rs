@@ -451,7 +451,13 @@ impl<I: Clone> Aligner<I> {
 
     fn at_gap(&mut self, stream: usize, tick_ns: i64, sink: &mut impl RowSink<I>) -> Result<Step, Stop> {
         let buffer = &self.buffers[stream];
-        let last_ns = buffer.last_at(tick_ns).map(|index| buffer.time(index).key_ns);
+        let last_ns = match (&self.pending, self.rule.ticks) {
+            // A pause of the stream that gives the ticks lies before this tick, which is a sample of it.
+            (Some(pending), Ticks::Reference { stream: reference }) if reference == stream => {
+                Some(pending.time_ns)
+            }
+            _ => buffer.last_at(tick_ns).map(|index| buffer.time(index).key_ns),
+        };
         let rule = self.rule.streams[stream].gap;
         if self.is_last_breath(stream, tick_ns) {
             self.end_episode(EndReason::EndOfData, sink);

@@ -18,7 +18,7 @@ use crate::suggest::DecodingProbe;
   gawm-ingest inspect run.mcap
   gawm-ingest inspect --format json logs/ > logs.json")]
 pub(crate) struct InspectArgs {
-    /// MCAP files, rosbag2 folders, or folders of either
+    /// MCAP, HDF5 and npz files, rosbag2 and LeRobot folders, or folders of them
     #[arg(value_name = "LOG", required = true)]
     logs: Vec<PathBuf>,
     /// How to print

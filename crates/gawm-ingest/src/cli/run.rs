@@ -27,7 +27,7 @@ pub(crate) struct RunArgs {
     /// Folder of the dataset; must be absent or empty unless --resume or --append is given
     #[arg(long, value_name = "DIR", required_unless_present = "print_config")]
     out: Option<PathBuf>,
-    /// MCAP files, rosbag2 folders, or folders of either
+    /// MCAP, HDF5 and npz files, rosbag2 and LeRobot folders, or folders of them
     #[arg(value_name = "LOG", required_unless_present = "print_config")]
     logs: Vec<PathBuf>,
     /// Write what became of every message as JSON

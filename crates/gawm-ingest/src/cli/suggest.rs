@@ -14,7 +14,7 @@ use crate::suggest;
 #[command(after_long_help = "Example:
   gawm-ingest suggest run.mcap > contract.toml")]
 pub(crate) struct SuggestArgs {
-    /// MCAP files, rosbag2 folders, or folders of either
+    /// MCAP, HDF5 and npz files, rosbag2 and LeRobot folders, or folders of them
     #[arg(value_name = "LOG", required = true)]
     logs: Vec<PathBuf>,
     /// Folder of .msg files for channels without a schema

@@ -229,7 +229,7 @@ fn push_list(
     }
     data.extend_from_slice(&CDR_HEADER);
     let count =
-        u32::try_from(range.len()).map_err(|_| NoMessage::Unreadable("too long a list".to_owned()))?;
+        u32::try_from(range.len()).map_err(|_beyond| NoMessage::Unreadable("too long a list".to_owned()))?;
     data.extend_from_slice(&count.to_le_bytes());
     if !range.is_empty() {
         align(start, leaf.size(), data);

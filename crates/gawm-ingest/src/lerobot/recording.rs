@@ -114,7 +114,7 @@ impl LerobotRecording {
         }
         let n_rows = self.dataset.n_rows();
         for (name, kind) in named.iter().filter(|(name, _)| !INDEX_COLUMNS.contains(&name.as_str())) {
-            let id = u16::try_from(self.channels.len() + 1).map_err(|_| Error::TooMany {
+            let id = u16::try_from(self.channels.len() + 1).map_err(|_beyond| Error::TooMany {
                 path: self.dataset.root.clone(),
                 what: "columns",
                 limit: u64::from(u16::MAX),

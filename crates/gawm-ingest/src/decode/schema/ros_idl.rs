@@ -379,7 +379,7 @@ impl Parser {
             _ => return Err(self.fault("a number")),
         };
         self.at += 1;
-        usize::try_from(value).map_err(|_| Fault::TooLarge)
+        usize::try_from(value).map_err(|_beyond| Fault::TooLarge)
     }
 
     /// Finds the full name of what a name stands for, from the inner scope to the outer.

@@ -146,7 +146,7 @@ fn cut_and_padded_messages() {
     check_row(&JOINT_STATE, &fields, &[&message[..], &[0; 40]].concat(), Some(12_000_000_005), &[1.0]);
     let error = row_error(&JOINT_STATE, &fields, &[&message[..], &[7; 20]].concat());
     assert!(matches!(error, DecodeError::TrailingBytes { surplus: 20, .. }));
-    for (id, name) in [(7, "CDR2_LE"), (3, "PL_CDR_LE"), (9, "D_CDR2_LE")] {
+    for (id, name) in [(2, "PL_CDR_BE"), (3, "PL_CDR_LE"), (4, "XML")] {
         let mut other = message.clone();
         other[1] = id;
         let error = row_error(&JOINT_STATE, &fields, &other);
@@ -224,7 +224,9 @@ fn unknown_fields_list_what_exists() {
     let no_schema = ChannelSchema { schema_name: "my_msgs/msg/Thing", ..JOINT_STATE };
     assert!(matches!(refused(&no_schema, "x"), CompileError::NoSchema { .. }));
     let idl = ChannelSchema { schema_encoding: "ros2idl", schema_data: b"module", ..JOINT_STATE };
-    assert!(matches!(refused(&idl, "x"), CompileError::UnsupportedEncoding { .. }));
+    assert!(matches!(refused(&idl, "x"), CompileError::BadSchema { .. }));
+    let other = ChannelSchema { message_encoding: "capnproto", schema_encoding: "capnproto", ..JOINT_STATE };
+    assert!(matches!(refused(&other, "x"), CompileError::UnsupportedEncoding { .. }));
 }
 
 #[test]
