@@ -11,7 +11,7 @@ use gawm_schema::batch::{BatchView, Hello, Section, Split};
 use self::fixture::{EpisodePlan, SIZE, episode, plans, raw, wrist_jpeg, write};
 use crate::{BatchMaker, Cache, CachePlan, Compat, Index, LoadError, LoaderConfig, MixEntry, RunLength};
 
-const GO_ON: AtomicBool = AtomicBool::new(false);
+static GO_ON: AtomicBool = AtomicBool::new(false);
 
 fn config() -> LoaderConfig {
     LoaderConfig { batch: 4, ..LoaderConfig::default() }
@@ -216,9 +216,11 @@ fn a_batch_depends_on_its_position_alone() {
 #[test]
 fn ranks_share_a_step() {
     let (_folder, path) = dataset(&plans());
-    let alone = Index::build(&[path.clone()], &LoaderConfig { batch: 8, ..config() }, run()).unwrap();
-    let of_rank =
-        |rank| Index::build(&[path.clone()], &config(), RunLength { rank, ranks: 2, ..run() }).unwrap();
+    let alone =
+        Index::build(std::slice::from_ref(&path), &LoaderConfig { batch: 8, ..config() }, run()).unwrap();
+    let of_rank = |rank| {
+        Index::build(std::slice::from_ref(&path), &config(), RunLength { rank, ranks: 2, ..run() }).unwrap()
+    };
     let ranks = [of_rank(0), of_rank(1)];
     assert_eq!(ranks[0].stream_hash(), ranks[1].stream_hash());
     for n in 0..7 {

@@ -3,6 +3,7 @@
 //!
 //! `GAWM_KILLS=100 cargo test -p gawm-loader --test kill` kills so many of each; the default is quick. `GAWM_KILL_SEED` draws
 //! other moments. Nothing waits for a time to pass: moments are drawn as deadlines of waits and as numbers of batches.
+#![expect(clippy::unwrap_used, reason = "a test that cannot set up has failed")]
 
 mod fixture;
 

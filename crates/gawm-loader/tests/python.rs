@@ -1,4 +1,5 @@
 //! A live slot read from Python, with numpy over the memory and nothing of ours in between; and where its memory lies.
+#![expect(clippy::unwrap_used, reason = "a test that cannot set up has failed")]
 
 mod fixture;
 

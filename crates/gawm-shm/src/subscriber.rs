@@ -1,5 +1,6 @@
 //! The trainer's side of one loader.
 
+use std::fmt;
 use std::ops::Deref;
 use std::time::Instant;
 
@@ -139,35 +140,34 @@ impl Subscriber {
         self.domain.is_loader_alive()
     }
 
+    /// Checks that a batch is the one that is due; texts are made for messages only, since this runs for every batch.
     fn check(&self, n: u64, header: &SlotHeader) -> Result<(), ShmError> {
-        let greeted = self.hello.as_ref().expect("checked after the hello");
+        let Greeted { hello, stream_hash, .. } = self.hello.as_ref().expect("checked after the hello");
         let loader = self.loader();
-        let Hello { schema_hash, ranks, sequence, .. } = &greeted.hello;
-        // Texts are made for messages only: this runs for every batch.
-        let fields: [(&'static str, bool, &dyn Fn() -> (String, String)); 6] = [
-            ("schema hash", header.schema_hash == *schema_hash, &|| {
-                (schema_hash.to_string(), header.schema_hash.to_string())
-            }),
-            ("stream hash", header.stream_hash == greeted.stream_hash, &|| {
-                (greeted.stream_hash.to_string(), header.stream_hash.to_string())
-            }),
-            ("position", header.n == n, &|| (n.to_string(), header.n.to_string())),
-            ("batch", sequence.batch(n) == Some(header.batch), &|| {
-                (format!("{:?}", sequence.batch(n)), format!("{:?}", header.batch))
-            }),
-            ("loader", (header.loader, header.loaders) == (loader, self.loaders), &|| {
-                let got = format!("{} of {}", header.loader, header.loaders);
-                (format!("{loader} of {}", self.loaders), got)
-            }),
-            ("number of ranks", header.ranks == *ranks, &|| (ranks.to_string(), header.ranks.to_string())),
-        ];
-        match fields.into_iter().find(|(_, is_right, _)| !is_right) {
-            Some((field, _, texts)) => {
-                let (expected, got) = texts();
-                Err(ShmError::Sequence { loader, field, expected, got })
-            }
-            None => Ok(()),
+        let wrong = |field, expected: &dyn fmt::Display, got: &dyn fmt::Display| {
+            Err(ShmError::Sequence { loader, field, expected: expected.to_string(), got: got.to_string() })
+        };
+        if header.schema_hash != hello.schema_hash {
+            return wrong("schema hash", &hello.schema_hash, &header.schema_hash);
         }
+        if header.stream_hash != *stream_hash {
+            return wrong("stream hash", stream_hash, &header.stream_hash);
+        }
+        if header.n != n {
+            return wrong("position", &n, &header.n);
+        }
+        let batch = hello.sequence.batch(n);
+        if batch != Some(header.batch) {
+            return wrong("batch", &format!("{batch:?}"), &format!("{:?}", header.batch));
+        }
+        if (header.loader, header.loaders) != (loader, self.loaders) {
+            let got = format!("{} of {}", header.loader, header.loaders);
+            return wrong("loader", &format!("{loader} of {}", self.loaders), &got);
+        }
+        if header.ranks != hello.ranks {
+            return wrong("number of ranks", &hello.ranks, &header.ranks);
+        }
+        Ok(())
     }
 
     fn receive(

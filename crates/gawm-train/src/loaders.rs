@@ -157,14 +157,17 @@ impl Loaders {
         self.subscribers[index] = None;
         self.children[index] = None;
         let loaders = self.options.loaders;
-        self.subscribers[index] = Some(self.claim.subscribe(loader, loaders, deadline)?);
+        let subscriber = self.claim.subscribe(loader, loaders, deadline)?;
         if let Some(command) = &self.options.command {
             let mut command = command.of(&self.options.service, loader, loaders, n);
+            // Without it a loader that outlives this trainer before it has connected could attach to the next one.
+            command.args(["--token", subscriber.token()]);
             let program = command.get_program().into();
             let child = command.spawn().map_err(|cause| LoaderError::Start { loader, program, cause })?;
             (self.options.say)(&format!("loader {loader} started at batch {n} (process {})", child.id()));
             self.children[index] = Some(Running(child));
         }
+        self.subscribers[index] = Some(subscriber);
         Ok(())
     }
 

@@ -4,7 +4,7 @@ use clap::Args;
 
 use super::clean::Format;
 use super::{DataArgs, Failure, Global, cache::open_cache, print, run::describe, stop_flag};
-use crate::bench::{BenchReport, measure};
+use crate::bench::{BenchReport, LATENCY_BATCHES, measure};
 use crate::index::{Index, RunLength};
 
 /// Arguments of `bench`.
@@ -30,7 +30,7 @@ pub(crate) struct BenchArgs {
 pub(crate) fn run(args: &BenchArgs, global: &Global) -> Result<(), Failure> {
     let Some(config) = args.data.load()? else { return Ok(()) };
     let stop = stop_flag();
-    let total_steps = args.steps.saturating_add(args.warmup);
+    let total_steps = args.steps.saturating_add(args.warmup).saturating_add(LATENCY_BATCHES);
     let index = Index::build(&args.data.data, &config, RunLength { total_steps, ..RunLength::default() })?;
     describe(&index, global);
     drop(open_cache(&index, &stop, global)?);

@@ -40,7 +40,7 @@ pub struct BatchShape {
 /// One array in a slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Section {
-    /// Clip ids, u64 [B].
+    /// Clip ids, u64, shape `[B]`.
     ClipIds,
     /// Frames, u8 [B, T, V, H, W, C].
     Frames,

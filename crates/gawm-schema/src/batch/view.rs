@@ -55,7 +55,7 @@ impl<'a> BatchView<'a> {
         &self.shape
     }
 
-    /// Returns the clip ids, shape [B]: dataset number in the upper 16 bits, the first row of the clip in the others.
+    /// Returns the clip ids, shape `[B]`: dataset number in the upper 16 bits, the first row of the clip in the others.
     pub fn clip_ids(&self) -> &'a [u64] {
         self.clip_ids
     }
@@ -94,7 +94,7 @@ impl<'a> BatchView<'a> {
 /// The sections of a slot that is being filled: typed, disjoint, for all `B` clips. The header is not among them.
 #[derive(Debug)]
 pub struct SectionsMut<'a> {
-    /// Clip ids, shape [B].
+    /// Clip ids, shape `[B]`.
     pub clip_ids: &'a mut [u64],
     /// Frames, shape [B, T, V, H, W, C].
     pub frames: &'a mut [u8],
