@@ -11,7 +11,9 @@ use std::process::ExitCode;
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use gawm_train::loaders::LoaderProgram;
 
-use crate::pipeline::{Outcome, Pipeline, PipelineError, RunError, RunOptions, StepName, pass_interrupts_on, run};
+use crate::pipeline::{
+    Outcome, Pipeline, PipelineError, RunError, RunOptions, StepName, pass_interrupts_on, run,
+};
 use crate::quickstart::{self, QuickstartError};
 
 /// Raw robot and simulator logs to trajectories, world models, plans and honest numbers
@@ -189,12 +191,14 @@ fn run_quickstart(arguments: &QuickstartArgs) -> ExitCode {
 fn try_run_quickstart(arguments: &QuickstartArgs) -> Result<ExitCode, QuickstartError> {
     if arguments.print_config {
         let path = Path::new("quickstart");
-        let pipeline = Pipeline::parse(path, quickstart::PIPELINE, &arguments.set).map_err(RunError::Pipeline)?;
+        let pipeline =
+            Pipeline::parse(path, quickstart::PIPELINE, &arguments.set).map_err(RunError::Pipeline)?;
         print(&pipeline.text_of(&crate::pipeline::SECTIONS));
         return Ok(ExitCode::SUCCESS);
     }
     let program = prepare()?;
-    let done = quickstart::quickstart(&arguments.out, &arguments.set, &program, &mut |line| eprintln!("{line}"))?;
+    let done =
+        quickstart::quickstart(&arguments.out, &arguments.set, &program, &mut |line| eprintln!("{line}"))?;
     let summary = &done.summary;
     let percent = |fraction: f64| 100.0 * fraction;
     print(&format!(

@@ -215,7 +215,15 @@ fn evaluate(layout: &Layout, name: StepName, verb: &str, what: &str, output: &Pa
     let mut arguments: Vec<OsString> = vec!["eval".into(), verb.into(), layout.run.clone().into()];
     arguments.extend(["--config".into(), layout.config.clone().into()]);
     arguments.extend(["--data".into(), layout.dataset.clone().into(), "--out".into(), output.into()]);
-    Step { name, what: what.to_owned(), arguments, resume: None, output: output.to_owned(), stdout: None, key }
+    Step {
+        name,
+        what: what.to_owned(),
+        arguments,
+        resume: None,
+        output: output.to_owned(),
+        stdout: None,
+        key,
+    }
 }
 
 /// A hash that grows with what is read, step by step: the key of a step covers all steps before it.

@@ -93,7 +93,9 @@ fn curves(page: &mut Page, layout: &Layout) -> Result<(), QuickstartError> {
         .map_err(|error| QuickstartError::Content { path, detail: error.to_string() })?;
     let validations: Vec<&Value> = records.iter().filter(|record| record["kind"] == "validation").collect();
     page.heading("What was learned");
-    page.note("Held-out episodes. Skill is 1 - loss / loss of the baseline: 0 is no better than it, 1 is perfect.");
+    page.note(
+        "Held-out episodes. Skill is 1 - loss / loss of the baseline: 0 is no better than it, 1 is perfect.",
+    );
     let series = |name: &str, value: &dyn Fn(&Value) -> Option<f64>| Line {
         name: name.to_owned(),
         points: validations

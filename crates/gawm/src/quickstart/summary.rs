@@ -40,7 +40,9 @@ impl Summary {
         };
         let rate = |set: &SetResult, solver: Solver| {
             let result = set.solver(solver);
-            result.map(|result| result.any).ok_or_else(|| format!("expected {} in {:?}", solver.name(), set.name))
+            result
+                .map(|result| result.any)
+                .ok_or_else(|| format!("expected {} in {:?}", solver.name(), set.name))
         };
         let (plain, wall) = (set("non-trivial")?, set("wall")?);
         let (model, blind) = (rate(wall, Solver::Model)?, rate(wall, Solver::WallBlind)?);
@@ -64,7 +66,9 @@ fn verdict(model: Rate, blind: Rate, untrained: Rate) -> String {
         let (low, high) = (100.0 * rate.interval.low, 100.0 * rate.interval.high);
         format!("{:.0} % [{low:.0}, {high:.0}]", 100.0 * rate.rate)
     };
-    let judgement = if model.interval.low > blind.interval.high && model.interval.low > untrained.interval.high {
+    let judgement = if model.interval.low > blind.interval.high
+        && model.interval.low > untrained.interval.high
+    {
         "The model knows the wall: it beats the search that is blind for it and the untrained encoder, and their 95 % intervals do not touch."
     } else if model.interval.low > untrained.interval.high {
         "The model learned to move, but that it knows the wall is not shown: its interval touches that of the search that is blind for the wall."
