@@ -11,6 +11,8 @@ use crate::pipeline::{Layout, Outcome};
 
 /// Figures of the diagnosis that the page shows, in order, as far as they are there.
 const MAX_FIGURES: usize = 12;
+/// Where curves of skill are cut off.
+const LOWEST_SKILL: f64 = -1.0;
 
 /// Makes the page.
 pub(super) fn page(
@@ -103,20 +105,22 @@ fn curves(page: &mut Page, layout: &Layout) -> Result<(), QuickstartError> {
             .filter_map(|record| Some((record["step"].as_f64()?, value(record)?)))
             .collect(),
     };
+    // Early validations can lie far below: running statistics lag behind weights that move fast (docs/training.md).
+    let skill = |value: Option<f64>| value.map(|value| value.max(LOWEST_SKILL));
     let skills = [
-        series("prediction against identity", &|record| record["skill"].as_f64()),
-        series("with shuffled actions", &|record| record["skill_shuffled_actions"].as_f64()),
+        series("prediction against identity", &|record| skill(record["skill"].as_f64())),
+        series("with shuffled actions", &|record| skill(record["skill_shuffled_actions"].as_f64())),
     ];
-    page.figure(&lines("Skill of the prediction", ("step", "skill"), &skills, &[0.0], Some((-1.0, 1.0))));
+    page.figure(&lines("Skill of the prediction", ("step", "skill"), &skills, &[0.0], Some((LOWEST_SKILL, 1.0))));
     let of_term = |record: &Value, name: &str| {
         let terms = record["terms"].as_array()?;
         terms.iter().find(|term| term["term"] == name)?["baseline"]["skill"].as_f64()
     };
     let heads = [
-        series("state", &|record| of_term(record, "state-alignment")),
-        series("action", &|record| of_term(record, "inverse-dynamics")),
+        series("state", &|record| skill(of_term(record, "state-alignment"))),
+        series("action", &|record| skill(of_term(record, "inverse-dynamics"))),
     ];
-    page.figure(&lines("Skill of the heads", ("step", "skill"), &heads, &[0.0], Some((-1.0, 1.0))));
+    page.figure(&lines("Skill of the heads", ("step", "skill"), &heads, &[0.0], Some((LOWEST_SKILL, 1.0))));
     let rank = [series("effective rank", &|record| record["effective_rank"].as_f64())];
     page.figure(&lines("Effective rank of the latents", ("step", "rank"), &rank, &[1.0], None));
     Ok(())
