@@ -5,7 +5,7 @@
 //! dV = P^T dO,  dP = dO V^T,  dS = P (dP - rowsum(dO O)),  dQ = scale dS K,  dK = scale dS^T Q
 //! ```
 //!
-//! Queries go through in blocks of [`BLOCK`] rows, whose scores stay in the cache. Forward keeps the logarithm of each
+//! Queries go through in blocks of `BLOCK` rows, whose scores stay in the cache. Forward keeps the logarithm of each
 //! row's sum; backward computes the probabilities again from it.
 
 use crate::gemm::{ACCUMULATE, Epilogue, Lhs, Packed, Rhs, STORE, gemm, panel_width};

@@ -143,7 +143,7 @@ pub fn takes(x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> bool {
     plain(x) && x.elem_count() > 0 && parameter(weight) && bias.is_none_or(parameter)
 }
 
-/// `y = x W^T + b`: `x` [rows, inputs], `weight` [outputs, inputs], `bias` [outputs] to [rows, outputs].
+/// `y = x W^T + b`: `x` `[rows, inputs]`, `weight` `[outputs, inputs]`, `bias` `[outputs]` to `[rows, outputs]`.
 ///
 /// Where `sink` collects, gradients of weight and bias go there; else they follow candle's way.
 ///

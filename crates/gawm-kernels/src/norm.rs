@@ -81,7 +81,7 @@ vectorized! {
         }
     }
 
-    /// Adds the columns of `x` [rows, width] to `sums` [width].
+    /// Adds the columns of `x`, `[rows, width]`, to `sums`, `[width]`.
     pub fn add_columns(x: &[f32], sums: &mut [f32]) {
         for row in x.chunks_exact(sums.len()) {
             for (sum, x) in sums.iter_mut().zip(row) {

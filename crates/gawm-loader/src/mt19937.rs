@@ -51,7 +51,7 @@ impl Mt19937 {
     /// Returns `torch.randperm(n)` for n below 2^32 / 20, above which torch draws 64 bits.
     ///
     /// # Panics
-    /// If n is not below that bound; [`MAX_PERMUTATION`] says it.
+    /// If n is not below that bound; `MAX_PERMUTATION` says it.
     pub fn permutation(&mut self, n: u32) -> Vec<u32> {
         assert!(n <= MAX_PERMUTATION, "a permutation of {n} elements");
         let mut order: Vec<u32> = (0..n).collect();

@@ -53,7 +53,7 @@ pub struct Prediction {
     pub row: usize,
     /// Chunks ahead.
     pub chunks: usize,
-    /// The predicted latent [D].
+    /// The predicted latent `[D]`.
     pub z: Vec<f32>,
 }
 
