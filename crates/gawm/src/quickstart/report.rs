@@ -111,7 +111,13 @@ fn curves(page: &mut Page, layout: &Layout) -> Result<(), QuickstartError> {
         series("prediction against identity", &|record| skill(record["skill"].as_f64())),
         series("with shuffled actions", &|record| skill(record["skill_shuffled_actions"].as_f64())),
     ];
-    page.figure(&lines("Skill of the prediction", ("step", "skill"), &skills, &[0.0], Some((LOWEST_SKILL, 1.0))));
+    page.figure(&lines(
+        "Skill of the prediction",
+        ("step", "skill"),
+        &skills,
+        &[0.0],
+        Some((LOWEST_SKILL, 1.0)),
+    ));
     let of_term = |record: &Value, name: &str| {
         let terms = record["terms"].as_array()?;
         terms.iter().find(|term| term["term"] == name)?["baseline"]["skill"].as_f64()
