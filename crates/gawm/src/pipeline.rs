@@ -2,7 +2,6 @@
 
 mod ledger;
 mod run;
-mod sim;
 mod steps;
 
 use std::path::{Path, PathBuf};
@@ -10,7 +9,6 @@ use std::path::{Path, PathBuf};
 pub use ledger::{Ledger, LedgerEntry, LedgerError};
 pub(crate) use run::pass_interrupts_on;
 pub use run::{Outcome, RunError, RunOptions, StepReport, run};
-pub use sim::SimSection;
 pub(crate) use steps::Layout;
 pub use steps::{Step, StepName, plan_steps};
 
@@ -26,8 +24,6 @@ pub struct Pipeline {
     pub path: PathBuf,
     /// The whole document, overrides applied.
     pub document: toml::Table,
-    /// `[sim]`, when there is one.
-    pub sim: Option<SimSection>,
 }
 
 /// Why a pipeline cannot be used.
@@ -42,7 +38,7 @@ pub enum PipelineError {
         /// The cause.
         source: std::io::Error,
     },
-    /// The file is not TOML, or `[sim]` does not hold what it must.
+    /// The file is not TOML.
     #[error("{path}: {detail}")]
     Syntax {
         /// The pipeline.
@@ -110,16 +106,7 @@ impl Pipeline {
                 return Err(PipelineError::UnknownSection { path: path.to_owned(), name: name.clone() });
             }
         }
-        let sim = match document.get("sim") {
-            Some(section) => Some(
-                section
-                    .clone()
-                    .try_into::<SimSection>()
-                    .map_err(|error| syntax(format!("[sim]: {error}")))?,
-            ),
-            None => None,
-        };
-        Ok(Pipeline { path: path.to_owned(), document, sim })
+        Ok(Pipeline { path: path.to_owned(), document })
     }
 
     /// Whether the file has this section.

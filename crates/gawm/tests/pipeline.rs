@@ -70,6 +70,20 @@ fn what_is_not_ours_is_not_removed() {
 }
 
 #[test]
+fn a_section_is_checked_by_the_program_that_reads_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let pipeline = write_pipeline(folder.path());
+    let out = folder.path().join("out");
+    let arguments =
+        ["run", pipeline.to_str().unwrap(), "--out", out.to_str().unwrap(), "--set", "sim.sede=1"];
+    let output = gawm(&arguments);
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{stderr}");
+    assert!(stderr.contains("sede") && stderr.contains("step collect"), "{stderr}");
+    assert!(!out.join("dataset").exists());
+}
+
+#[test]
 fn a_step_that_fails_ends_the_pipeline_and_can_be_repeated() {
     let folder = tempfile::tempdir().unwrap();
     let pipeline = write_pipeline(folder.path());
@@ -80,7 +94,7 @@ fn a_step_that_fails_ends_the_pipeline_and_can_be_repeated() {
     assert_eq!(broken.status.code(), Some(1), "{stderr}");
     assert!(stderr.contains("step ingest"), "{stderr}");
     let repaired = check_run(&pipeline, &out, &[]);
-    assert!(repaired.contains("collect: 4 episodes of two-room: up to date"), "{repaired}");
+    assert!(repaired.contains("collect: a simulator's episodes to logs: up to date"), "{repaired}");
 }
 
 #[test]

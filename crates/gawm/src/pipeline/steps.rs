@@ -104,21 +104,11 @@ pub fn plan_steps(pipeline: &Pipeline, out: &Path, logs: &[PathBuf]) -> Result<V
     let missing = |name| PipelineError::MissingSection { path: pipeline.path.clone(), name };
 
     let inputs = if logs.is_empty() {
-        let sim = pipeline.sim.as_ref();
-        let sim = sim.ok_or_else(|| PipelineError::NoLogs { path: pipeline.path.clone() })?;
+        if !pipeline.has("sim") {
+            return Err(PipelineError::NoLogs { path: pipeline.path.clone() });
+        }
         key.add(&pipeline.text_of(&["sim"]));
-        let mut arguments: Vec<OsString> = vec!["sim".into()];
-        arguments.extend(sim.arguments());
-        arguments.extend(["--out".into(), layout.logs.clone().into()]);
-        steps.push(Step {
-            name: StepName::Collect,
-            what: format!("{} episodes of {}", sim.episodes, sim.env),
-            arguments,
-            resume: None,
-            output: layout.logs.clone(),
-            stdout: None,
-            key: key.digest(),
-        });
+        steps.push(collect(&layout, key.digest()));
         vec![layout.logs.clone()]
     } else {
         for log in logs {
@@ -146,6 +136,20 @@ pub fn plan_steps(pipeline: &Pipeline, out: &Path, logs: &[PathBuf]) -> Result<V
         }
     }
     Ok(steps)
+}
+
+fn collect(layout: &Layout, key: String) -> Step {
+    let mut arguments: Vec<OsString> = ["sim", "collect", "--config"].map(OsString::from).to_vec();
+    arguments.extend([layout.config.clone().into(), "--out".into(), layout.logs.clone().into()]);
+    Step {
+        name: StepName::Collect,
+        what: "a simulator's episodes to logs".to_owned(),
+        arguments,
+        resume: None,
+        output: layout.logs.clone(),
+        stdout: None,
+        key,
+    }
 }
 
 fn ingest(layout: &Layout, inputs: &[PathBuf], key: String) -> Step {

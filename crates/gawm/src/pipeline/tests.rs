@@ -20,7 +20,7 @@ fn keys(pipeline: &Pipeline) -> Vec<(StepName, String)> {
 fn an_override_sets_a_value_of_its_type() {
     let pipeline =
         pipeline(TEXT, &["sim.episodes=7", "ingest.ticks.fps=2.5", "ingest.robot_type=arm"]).unwrap();
-    assert_eq!(pipeline.sim.as_ref().unwrap().episodes, 7);
+    assert_eq!(pipeline.document["sim"]["episodes"].as_integer(), Some(7));
     assert_eq!(pipeline.document["ingest"]["ticks"]["fps"].as_float(), Some(2.5));
     assert_eq!(pipeline.document["ingest"]["robot_type"].as_str(), Some("arm"));
 }
@@ -30,7 +30,6 @@ fn what_no_program_reads_is_refused() {
     assert!(
         matches!(pipeline("[trian]\n", &[]), Err(PipelineError::UnknownSection { name, .. }) if name == "trian")
     );
-    assert!(matches!(pipeline(TEXT, &["sim.sede=1"]), Err(PipelineError::Syntax { .. })));
     assert!(matches!(pipeline(TEXT, &["sim"]), Err(PipelineError::Override { .. })));
     assert!(matches!(pipeline(TEXT, &["episodes=1"]), Err(PipelineError::Override { .. })));
     assert!(matches!(pipeline(TEXT, &["sim.seed.x=1"]), Err(PipelineError::Override { .. })));
