@@ -333,3 +333,25 @@ fn a_finished_run_is_not_trained_again_and_not_written_over() {
     assert_eq!(output.status.code(), Some(2), "{stderr}");
     assert!(stderr.contains("not empty") && stderr.contains("--resume"), "{stderr}");
 }
+
+#[test]
+fn loaders_started_by_hand_give_the_same_run() {
+    let world = world();
+    let run = world.run("by-hand");
+    let child =
+        start(world.folder.path(), &run, &["--service", "by-hand", "--attach", "--set", "loader.loaders=1"]);
+    let length = ["--total-steps", "16", "--validate-every", "6", "--validation-batches", "2"];
+    let loader = Command::new(env!("CARGO_BIN_EXE_e2e-gawm-loader"))
+        .args(["run", "--quiet", "--service", "by-hand", "--loader", "0", "--loaders", "1"])
+        .args(["--config", world.run("p.toml").to_str().unwrap()])
+        .args(["--data", world.run("data").to_str().unwrap()])
+        .args(length)
+        .env("TMPDIR", place(&run))
+        .output()
+        .unwrap();
+    assert!(loader.status.success(), "{}", String::from_utf8_lossy(&loader.stderr));
+    let (code, lines) = lines_of(child);
+    assert_eq!(code, Some(0), "{}", lines.join("\n"));
+    assert_eq!(Products::of(&run).metrics, world.expected.metrics);
+    world.check_clean(&run);
+}
