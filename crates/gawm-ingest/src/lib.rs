@@ -15,3 +15,4 @@ mod rows;
 pub mod run;
 pub mod suggest;
 pub mod tabular;
+mod video;

@@ -32,6 +32,8 @@ pub enum ImageKind {
     Raw,
     /// JPEG, PNG or another file format.
     Compressed,
+    /// A packet of a video.
+    Video,
 }
 
 /// One image message.
@@ -83,23 +85,29 @@ impl ImageMessage<'_> {
 }
 
 impl ImagePlan {
-    /// Compiles a plan for sensor_msgs Image and CompressedImage, foxglove RawImage and CompressedImage, and types like them.
+    /// Compiles a plan for sensor_msgs Image and CompressedImage, foxglove RawImage, CompressedImage and CompressedVideo, and
+    /// types like them.
     ///
     /// # Errors
-    /// [`CompileError::NotAnImage`] if the type has no image's fields, names video, or the channel cannot be decoded.
+    /// [`CompileError::NotAnImage`] if the type has no image's fields, names video in a build without it, or the channel
+    /// cannot be decoded.
     pub fn compile(channel: &ChannelSchema<'_>, library: &SchemaLibrary) -> Result<Self, CompileError> {
         let types = library.types(channel)?;
         let not_image = |detail: String| CompileError::NotAnImage { topic: channel.topic.to_owned(), detail };
-        if channel.schema_name.ends_with("CompressedVideo") {
+        let is_video = channel.schema_name.ends_with("CompressedVideo");
+        if is_video && !crate::video::IS_BUILT {
             return Err(not_image(format!(
-                "{} holds video packets, which are not decoded; map a topic of single images",
-                channel.schema_name
+                "{} holds video packets, which this build does not decode; {}",
+                channel.schema_name,
+                crate::video::BUILD_HINT
             )));
         }
         let has = |path: &[&str]| has_path(&types.table, path);
         let is_open = types.encoding == Encoding::Json && types.table.root().fields.is_empty();
         let named_raw = is_raw_name(channel.schema_name);
-        let kind = if (has(&["width"]) && has(&["height"])) || (is_open && named_raw) {
+        let kind = if is_video {
+            ImageKind::Video
+        } else if (has(&["width"]) && has(&["height"])) || (is_open && named_raw) {
             ImageKind::Raw
         } else {
             ImageKind::Compressed
@@ -116,7 +124,7 @@ impl ImagePlan {
                 (Part::Step, vec!["step"]),
                 (Part::BigEndian, vec!["is_bigendian"]),
             ]),
-            ImageKind::Compressed => wanted.push((Part::Format, vec!["format"])),
+            ImageKind::Compressed | ImageKind::Video => wanted.push((Part::Format, vec!["format"])),
         }
         wanted.extend([(Part::FrameId, vec!["header", "frame_id"]), (Part::FrameId, vec!["frame_id"])]);
         let fields = Self::present(&types, is_open, &wanted);

@@ -13,6 +13,7 @@ use arrow::datatypes::{
 
 use crate::log::Channel;
 use crate::rows::{CDR_HEADER, HEADER_TEXT, align, channel, push_bytes, push_header, push_text};
+use crate::video::RgbFrame;
 
 /// Largest image file that is read by a path in a cell.
 const MAX_IMAGE_BYTES: u64 = 256 << 20;
@@ -137,6 +138,27 @@ impl CellKind {
 
 fn row_channel(topic: &str, text: String, id: u16) -> Channel {
     channel(topic, "gawm_msgs/msg/Row", text, id)
+}
+
+/// Makes the channel of a camera whose frames come out of a video file.
+pub(super) fn raw_image_channel(topic: &str, id: u16) -> Channel {
+    let fields = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n";
+    channel(topic, "sensor_msgs/msg/Image", format!("{fields}{HEADER_TEXT}"), id)
+}
+
+/// Appends the message of a video frame.
+pub(super) fn push_raw_image(frame: &RgbFrame, time_ns: i64, data: &mut Vec<u8>) -> Range<usize> {
+    let begin = data.len();
+    let start = push_header(time_ns, data);
+    align(start, 4, data);
+    data.extend_from_slice(&frame.height.to_le_bytes());
+    data.extend_from_slice(&frame.width.to_le_bytes());
+    push_text("rgb8", start, data);
+    data.push(0);
+    align(start, 4, data);
+    data.extend_from_slice(&frame.width.saturating_mul(3).to_le_bytes());
+    push_bytes(&frame.data, start, data);
+    begin..data.len()
 }
 
 /// Why a cell has no message.

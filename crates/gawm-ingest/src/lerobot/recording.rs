@@ -10,20 +10,23 @@ use std::sync::Arc;
 
 use arrow::array::RecordBatch;
 use bytes::Bytes;
-use gawm_dataset::read::{DType, Dataset, ReadLimits};
+use gawm_dataset::read::{DType, Dataset, FeatureDecl, ReadLimits};
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
-use super::cells::{CellKind, NoMessage, push_cell};
+use super::cells::{CellKind, NoMessage, push_cell, push_raw_image, raw_image_channel};
 use super::damage::damage_of;
 use super::{LerobotError, LerobotError as Error};
 use crate::log::{Block, BlockRef, Channel, Damage, DamageKind, Message, MetadataRecord};
 use crate::rows::{BLOCK_BYTES, EPISODE_GAP_NS, RowRecording, Unavailable};
+use crate::video::{self, VideoLanes};
 
 /// Columns that say which row it is, and nothing of the robot.
 const INDEX_COLUMNS: [&str; 4] = ["episode_index", "frame_index", "index", "timestamp"];
 /// Times of rows may differ from the grid by this share of a period before that is said.
 const GRID_TOLERANCE: f64 = 0.1;
+/// Times of rows that differ less from the grid are those of the grid, rounded to 32 bits.
+const GRID_ROUNDING_SECS: f64 = 5e-5;
 /// Rows of one batch of a reader.
 const BATCH_ROWS: usize = 1024;
 
@@ -36,6 +39,9 @@ pub struct LerobotRecording {
     metadata: Vec<MetadataRecord>,
     damage: Vec<Damage>,
     unavailable: Vec<Unavailable>,
+    /// Cameras whose frames are in video files.
+    cameras: BTreeSet<String>,
+    videos: VideoLanes,
     selected: BTreeSet<String>,
     spans: Vec<Span>,
     blocks: Vec<BlockRef>,
@@ -49,6 +55,8 @@ struct Episode {
     start_ns: i64,
     /// Frame number of each row, where they do not simply count from 0.
     frames: Option<Vec<i64>>,
+    /// `timestamp` of each row, where it is not that of the grid.
+    times: Option<Vec<f64>>,
 }
 
 /// Rows of one episode within one row group.
@@ -82,6 +90,8 @@ impl LerobotRecording {
             metadata: Vec::new(),
             damage,
             unavailable: Vec::new(),
+            cameras: BTreeSet::new(),
+            videos: VideoLanes::default(),
             selected: BTreeSet::new(),
             spans: Vec::new(),
             blocks: Vec::new(),
@@ -131,7 +141,20 @@ impl LerobotRecording {
                 }),
             }
         }
-        let absent = self.dataset.info.features.iter().filter(|feature| !named.contains_key(&feature.name));
+        let features = self.dataset.info.features.iter();
+        let (videos, absent): (Vec<&FeatureDecl>, Vec<&FeatureDecl>) = features
+            .filter(|feature| !named.contains_key(&feature.name))
+            .partition(|f| video::IS_BUILT && f.dtype == DType::Video && self.has_video(&f.name));
+        for feature in videos {
+            let id = u16::try_from(self.channels.len() + 1).map_err(|_beyond| Error::TooMany {
+                path: self.dataset.root.clone(),
+                what: "columns",
+                limit: u64::from(u16::MAX),
+            })?;
+            self.channels.push(Arc::new(raw_image_channel(&feature.name, id)));
+            self.cameras.insert(feature.name.clone());
+        }
+        let absent = absent.into_iter();
         let unavailable: Vec<Unavailable> =
             absent.map(|feature| self.unavailable_feature(&feature.name, &feature.dtype, n_rows)).collect();
         for found in &unavailable {
@@ -142,18 +165,20 @@ impl LerobotRecording {
         Ok(())
     }
 
+    /// Returns whether any episode has a video file of a camera.
+    fn has_video(&self, name: &str) -> bool {
+        let paths = self.dataset.episodes.iter().filter_map(|entry| self.dataset.video_path(entry, name));
+        paths.flatten().any(|path| self.dataset.root.join(path).is_file())
+    }
+
     fn unavailable_feature(&self, name: &str, dtype: &DType, rows: u64) -> Unavailable {
-        let has_video = || {
-            let paths = self.dataset.episodes.iter().filter_map(|entry| self.dataset.video_path(entry, name));
-            paths.flatten().any(|path| self.dataset.root.join(path).is_file())
-        };
         let (reason, detail, hint) = if *dtype != DType::Video {
             ("column_missing", "declared in meta/info.json, but no data file has it", "remove its stream")
-        } else if has_video() {
+        } else if self.has_video(name) {
             (
                 "video_not_decoded",
                 "its frames are in video files, which this build does not decode",
-                "convert the videos to images (lerobot-edit-dataset has convert_video_to_image), or remove its stream",
+                video::BUILD_HINT,
             )
         } else {
             (
@@ -192,11 +217,11 @@ impl LerobotRecording {
             let (Some(end_ns), Some(next)) = (end_ns, next) else {
                 return Err(Error::TooMany { path: path(), what: "nanoseconds", limit: i64::MAX as u64 });
             };
-            if let Some(found) = times.and_then(|times| off_grid(index, &times, frames.as_deref(), fps)) {
-                damage.push(found);
-            }
+            let off_secs = times.as_ref().map_or(0.0, |times| off_grid_secs(times, frames.as_deref(), fps));
+            damage.extend(off_grid(index, off_secs, fps));
+            let times = times.filter(|_| off_secs > GRID_ROUNDING_SECS);
             metadata.push(self.record(index, rows, task.as_deref().unwrap_or_default(), start_ns, end_ns));
-            episodes.push(Episode { index, run, start_ns, frames });
+            episodes.push(Episode { index, run, start_ns, frames, times });
             start_ns = next;
         }
         if episodes.is_empty() {
@@ -265,11 +290,30 @@ impl LerobotRecording {
     fn row_bytes(&self, file: usize) -> u64 {
         let fields = self.dataset.files[file].schema.fields().iter();
         let selected = fields.filter(|field| self.selected.contains(field.name()));
-        selected.fold(0, |bytes: u64, field| {
+        let bytes = selected.fold(0, |bytes: u64, field| {
             let declared = self.dataset.info.feature(field.name());
             let width = declared.map_or(1, |feature| feature.width() as u64);
             bytes.saturating_add(width.saturating_mul(8).min(1 << 20))
+        });
+        let frames = self.cameras.iter().filter(|camera| self.selected.contains(*camera));
+        frames.fold(bytes, |bytes, camera| {
+            let declared = self.dataset.info.feature(camera);
+            bytes.saturating_add(declared.map_or(1 << 20, |feature| feature.width() as u64))
         })
+    }
+
+    /// Returns when each row of a span is in the videos of its episode, which begins at `from_secs` in them.
+    fn video_times(&self, span: &Span, from_secs: f64) -> Vec<f64> {
+        let episode = &self.episodes[span.episode];
+        let row_secs = |row: u64| {
+            let at = usize::try_from(row).unwrap_or(usize::MAX);
+            if let Some(secs) = episode.times.as_ref().and_then(|times| times.get(at)) {
+                return *secs;
+            }
+            let frame = episode.frames.as_ref().and_then(|frames| frames.get(at).copied());
+            frame.map_or(row as f64, |frame| frame as f64) / self.dataset.info.fps
+        };
+        span.rows.clone().map(|row| from_secs + row_secs(row)).collect()
     }
 
     fn time_ns(&self, episode: usize, row: u64) -> i64 {
@@ -310,6 +354,9 @@ impl LerobotRecording {
             messages.take(&batch, row);
             row += batch.num_rows() as u64;
         }
+        for camera in self.cameras.iter().filter(|camera| self.selected.contains(*camera)) {
+            messages.take_video(camera);
+        }
         messages.finish();
         if row == span.rows.end {
             Ok(())
@@ -336,10 +383,13 @@ fn usual_frames(episode: i64, frames: Vec<i64>, damage: &mut Vec<Damage>) -> Opt
     rises.then_some(frames)
 }
 
-fn off_grid(episode: i64, times: &[f64], frames: Option<&[i64]>, fps: f64) -> Option<Damage> {
+/// Returns how far `timestamp` is from the grid at most.
+fn off_grid_secs(times: &[f64], frames: Option<&[i64]>, fps: f64) -> f64 {
     let expected = |row: usize| frames.map_or(row as f64, |frames| frames[row] as f64) / fps;
-    let largest =
-        times.iter().enumerate().map(|(row, time)| (time - expected(row)).abs()).fold(0.0, f64::max);
+    times.iter().enumerate().map(|(row, time)| (time - expected(row)).abs()).fold(0.0, f64::max)
+}
+
+fn off_grid(episode: i64, largest: f64, fps: f64) -> Option<Damage> {
     (largest > GRID_TOLERANCE / fps).then(|| Damage {
         kind: DamageKind::IndexMismatch,
         offset: 0,
@@ -402,6 +452,49 @@ impl Messages<'_> {
                 }
             }
         }
+    }
+
+    /// Takes the frames of a camera from its video file.
+    fn take_video(&mut self, camera: &str) {
+        let recording = self.recording;
+        let Some(channel) = recording.channels.iter().find(|channel| channel.topic == camera) else { return };
+        let dataset = &recording.dataset;
+        let entry = dataset.entry(recording.episodes[self.span.episode].index);
+        let path = entry.and_then(|entry| dataset.video_path(entry, camera));
+        let path = match path.unwrap_or_else(|| Err("no video file is named for it".to_owned())) {
+            Ok(path) => dataset.root.join(path),
+            Err(why) => {
+                let n_rows = self.span.rows.end - self.span.rows.start;
+                self.nulls.insert(camera.to_owned(), (n_rows, why));
+                return;
+            }
+        };
+        let start = entry.and_then(|entry| entry.videos.get(camera)).map_or(0.0, |v| v.from_timestamp_secs);
+        let wanted = recording.video_times(self.span, start);
+        self.out.channels.push(Arc::clone(channel));
+        let index = (self.out.channels.len() - 1) as u32;
+        recording.videos.read(&path, &wanted, |at, frame| {
+            let row = self.span.rows.start + at as u64;
+            let time_ns = recording.time_ns(self.span.episode, row);
+            match frame {
+                Ok(frame) => {
+                    let range = push_raw_image(&frame, time_ns, &mut self.data);
+                    let log_time_ns = u64::try_from(time_ns).unwrap_or(0);
+                    self.out.messages.push(Message {
+                        channel: index,
+                        sequence: u32::try_from(row).unwrap_or(u32::MAX),
+                        log_time_ns,
+                        publish_time_ns: log_time_ns,
+                        range,
+                        offset: row,
+                    });
+                }
+                Err(error) => {
+                    let lost = self.nulls.entry(camera.to_owned());
+                    lost.or_insert_with(|| (0, error.to_string())).0 += 1;
+                }
+            }
+        });
     }
 
     fn finish(self) {
@@ -496,10 +589,10 @@ impl RowRecording for LerobotRecording {
     }
 }
 
-/// The files that make the rows, sorted: metadata, data, images beside them.
+/// The files that make the rows, sorted: metadata, data, images and videos beside them.
 fn files_of(root: &Path) -> Vec<PathBuf> {
     let mut files = Vec::new();
-    let mut folders: Vec<PathBuf> = ["meta", "data", "images"].map(PathBuf::from).to_vec();
+    let mut folders: Vec<PathBuf> = ["meta", "data", "images", "videos"].map(PathBuf::from).to_vec();
     while let Some(folder) = folders.pop() {
         let Ok(entries) = std::fs::read_dir(root.join(&folder)) else { continue };
         for entry in entries.filter_map(Result::ok) {

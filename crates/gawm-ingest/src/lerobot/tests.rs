@@ -74,6 +74,22 @@ fn batch(episode: i64, frames: &[i64], is_odd: bool) -> RecordBatch {
     RecordBatch::try_new(Arc::new(Schema::new(fields)), arrays).unwrap()
 }
 
+/// Writes a data file with the state [i, -i] in each row.
+#[cfg(feature = "video")]
+pub(crate) fn write_rows(path: &Path, episode: i64, n_rows: usize) {
+    let frames: Vec<i64> = (0..n_rows as i64).collect();
+    let rows = batch(episode, &frames, false);
+    let columns = ["action", "timestamp", "frame_index", "episode_index", "index", "task_index"];
+    let at = |name: &&str| rows.schema().index_of(name).unwrap();
+    let rows = rows.project(&columns.iter().map(at).collect::<Vec<_>>()).unwrap();
+    let mut fields: Vec<Field> = rows.schema().fields().iter().map(|field| field.as_ref().clone()).collect();
+    fields[0] = fields[0].clone().with_name("observation.state");
+    let rows = RecordBatch::try_new(Arc::new(Schema::new(fields)), rows.columns().to_vec()).unwrap();
+    let mut writer = ArrowWriter::try_new(std::fs::File::create(path).unwrap(), rows.schema(), None).unwrap();
+    writer.write(&rows).unwrap();
+    writer.close().unwrap();
+}
+
 trait DataTypeOf {
     fn data_type_of(&self) -> DataType;
 }

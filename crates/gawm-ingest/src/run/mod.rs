@@ -20,6 +20,9 @@ mod source;
 mod unavailable;
 mod unpack;
 
+#[cfg(test)]
+pub(crate) mod tests;
+
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 

@@ -10,6 +10,7 @@ use gawm_schema::ImageSpec;
 
 use crate::contract::{self, ImageFormat};
 use crate::decode::{ImageKind, ImageMessage};
+use crate::video::RgbFrame;
 
 /// JPEG quality where the contract names none.
 const DEFAULT_QUALITY: u8 = 90;
@@ -34,6 +35,8 @@ enum Form {
     },
     /// PNG behind a header, as `compressedDepth` has it.
     CompressedDepth { format: String },
+    /// A packet of a video, which only means something after those before it.
+    Packet { format: String },
     /// Rows of pixels.
     Raw { layout: String, step: u32, is_big_endian: bool },
 }
@@ -58,6 +61,10 @@ impl Picture {
         keep: impl FnOnce(&[u8]) -> Bytes,
     ) -> Result<Picture, ImageError> {
         let data: &[u8] = &message.data;
+        if kind == ImageKind::Video {
+            let form = Form::Packet { format: message.format.clone().into_owned() };
+            return Ok(Picture { data: keep(data), form, width: 0, height: 0, is_depth: false });
+        }
         if kind == ImageKind::Raw {
             return raw(message, keep);
         }
@@ -79,6 +86,24 @@ impl Picture {
             height: header.height,
             is_depth: header.bits == 16 && header.channels == 1,
         })
+    }
+
+    /// Returns the picture of a decoded video frame.
+    pub(crate) fn of_frame(frame: RgbFrame) -> Picture {
+        let form = Form::Raw {
+            layout: "rgb8".to_owned(),
+            step: frame.width.saturating_mul(3),
+            is_big_endian: false,
+        };
+        Picture { data: frame.data, form, width: frame.width, height: frame.height, is_depth: false }
+    }
+
+    /// Returns format and bytes of a video packet, if it is one.
+    pub(crate) fn packet(&self) -> Option<(&str, &Bytes)> {
+        match &self.form {
+            Form::Packet { format } => Some((format, &self.data)),
+            _ => None,
+        }
     }
 
     /// Returns how many bytes the image holds.
@@ -145,7 +170,7 @@ impl Picture {
     fn decoded(&self) -> Result<Image, ImageError> {
         let limits = Limits::default();
         match &self.form {
-            Form::File { .. } => decode(&self.data, &limits),
+            Form::File { .. } | Form::Packet { .. } => decode(&self.data, &limits),
             Form::CompressedDepth { format } => decode_compressed_depth(format, &self.data, &limits),
             Form::Raw { layout, step, is_big_endian } => {
                 let raw = RawImage {

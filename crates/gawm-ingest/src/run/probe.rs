@@ -7,10 +7,12 @@ use gawm_schema::ImageSpec;
 
 use super::RunError;
 use super::bind::Binding;
+use super::picture::Picture;
 use super::plan::Plans;
 use super::recording::OpenRecording;
 use crate::contract::{CheckedContract, Clock, ContractError, StreamData, TickRule};
 use crate::decode::SchemaLibrary;
+use crate::video::{PacketDecoder, VideoError};
 
 /// Samples of the reference stream that its rate is measured from.
 const RATE_SAMPLES: usize = 400;
@@ -53,6 +55,7 @@ pub(crate) fn probe(
     };
     let plans = Plans::new(binding, &[], &[], library);
     let mut times: Vec<i64> = Vec::new();
+    let mut videos: BTreeMap<usize, FirstFrame> = BTreeMap::new();
     // Broken off or not, what was found is found.
     let _: ControlFlow<()> = open.read(&plans, 1, |_, block| {
         for message in &block.messages {
@@ -63,7 +66,18 @@ pub(crate) fn probe(
                     .first_loss
                     .get_or_insert_with(|| format!("the first lost as {}: {}", loss.reason, loss.detail));
             }
-            if let Some((picture, _)) = message.picture() {
+            let picture = message.picture().map(|(picture, _)| picture);
+            let decoded = picture.and_then(Picture::packet).map(|(format, data)| {
+                videos.entry(message.topic).or_default().of(format, data).map_err(|error| {
+                    let text = format!("the first lost as {}: {error}", error.reason());
+                    probed.first_loss.get_or_insert(text);
+                })
+            });
+            let picture = match &decoded {
+                None => picture,
+                Some(frame) => frame.as_ref().ok().and_then(Option::as_ref),
+            };
+            if let Some(picture) = picture {
                 for &stream in &topic.images {
                     if let StreamData::Image(rule) = &binding.streams[stream].rule.data {
                         probed.sizes.entry(stream).or_insert_with(|| picture.size(&rule.spec));
@@ -91,6 +105,30 @@ pub(crate) fn probe(
         probed.rate_hz = reference_rate(contract, &mut times)?;
     }
     Ok(probed)
+}
+
+/// Looks for the first frame of a video topic.
+#[derive(Debug, Default)]
+struct FirstFrame {
+    decoder: Option<PacketDecoder>,
+    n_packets: i64,
+    found: Option<Picture>,
+}
+
+impl FirstFrame {
+    /// Takes a packet; returns the first frame, once it is there.
+    fn of(&mut self, format: &str, data: &[u8]) -> Result<Option<Picture>, VideoError> {
+        if self.found.is_none() {
+            if self.decoder.is_none() {
+                self.decoder = Some(PacketDecoder::new(format)?);
+            }
+            self.n_packets += 1;
+            let frames = self.decoder.as_mut().map(|decoder| decoder.push(self.n_packets, data));
+            let frame = frames.transpose()?.and_then(|frames| frames.into_iter().next());
+            self.found = frame.map(|(_, frame)| Picture::of_frame(frame));
+        }
+        Ok(self.found.clone())
+    }
 }
 
 /// Returns the rate of reference ticks; over 1 % from an integer the contract must name one.

@@ -1,5 +1,7 @@
 //! One recording on its way through the aligner: order, duplicates, clock resets, marks, counts.
 
+mod video;
+
 use std::collections::{BTreeMap, VecDeque};
 
 use gawm_schema::{FloatType, Kind, Role, rotation};
@@ -43,6 +45,8 @@ pub(crate) struct Session<'a, 's> {
     pub(crate) warnings: Vec<String>,
     pub(crate) damage: Vec<Damage>,
     pub(crate) camera_infos: BTreeMap<String, CameraInfo>,
+    /// By topic what is known of its video.
+    videos: BTreeMap<usize, video::VideoTopic>,
     marks: BTreeMap<(i64, u64), Mark>,
     is_marked: bool,
     recent: Vec<Recent>,
@@ -119,6 +123,7 @@ impl<'a, 's> Session<'a, 's> {
             warnings: Vec::new(),
             damage: Vec::new(),
             camera_infos: BTreeMap::new(),
+            videos: BTreeMap::new(),
             marks: BTreeMap::new(),
             is_marked: false,
             recent: vec![Recent::default(); rules.plans.topics.len()],
@@ -267,6 +272,7 @@ impl<'a, 's> Session<'a, 's> {
     }
 
     fn close_segment(&mut self) -> Result<(), Stop> {
+        self.finish_videos();
         self.apply_marks(i64::MAX);
         if self.is_marked {
             self.unclosed += 1;
@@ -368,14 +374,17 @@ impl<'a, 's> Session<'a, 's> {
         }
         self.take_rows(&message, message.rows(rows), values, name);
         if let Some(extras) = message.take_extras() {
-            if let Some((picture, stamp_ns)) = extras.picture {
-                self.take_picture(&message, &picture, stamp_ns, name);
-            }
             if let Some(info) = extras.camera_info {
                 self.camera_infos.entry(name.to_owned()).or_insert(info);
             }
             if let Some(event) = extras.event {
                 self.take_event(&message, &event, name);
+            }
+            if let Some((picture, stamp_ns)) = extras.picture {
+                match picture.packet() {
+                    Some(packet) => self.take_packet(message, packet, stamp_ns),
+                    None => self.take_picture(&message, &picture, stamp_ns, name),
+                }
             }
         }
     }

@@ -13,6 +13,7 @@ use crate::contract::{
 };
 use crate::decode::{CameraInfo, ImagePlan, RowSink, SchemaLibrary, decode_to_json};
 use crate::run::{Picture, schema_of};
+use crate::video::PacketDecoder;
 
 /// Ticks per second are not proposed above this: more rows than a model needs.
 const MAX_RATE_HZ: f64 = 50.0;
@@ -140,11 +141,42 @@ fn is_camera(topic: &Topic, library: &SchemaLibrary) -> Option<Result<(u32, u32)
             let keep = |data: &[u8]| bytes::Bytes::copy_from_slice(data);
             Picture::new(&message, plan.kind(), keep).map_err(|error| error.to_string())
         }) {
+            Ok(picture) if picture.packet().is_some() => return Some(video_size(topic, &plan)),
             Ok(picture) => return Some(Ok(picture.recorded_size())),
             Err(error) => last = Some(error),
         }
     }
     named.then(|| Err(last.unwrap_or_else(|| "no image".to_owned())))
+}
+
+/// Returns the size of the first frame that the packets of a topic give.
+fn video_size(topic: &Topic, plan: &ImagePlan) -> Result<(u32, u32), String> {
+    let mut decoder: Option<PacketDecoder> = None;
+    let mut last = "no frame".to_owned();
+    for (number, sample) in topic.samples.iter().enumerate() {
+        let mut sink = RowSink::new();
+        let frames = plan.extract(sample, &mut sink).map_err(|error| error.to_string()).and_then(|message| {
+            let opened = match decoder.take() {
+                Some(decoder) => Ok(decoder),
+                None => PacketDecoder::new(&message.format),
+            };
+            let pushed = opened.and_then(|mut opened| {
+                let frames = opened.push(number as i64, &message.data);
+                decoder = Some(opened);
+                frames
+            });
+            pushed.map_err(|error| error.to_string())
+        });
+        match frames {
+            Ok(frames) => {
+                if let Some((_, frame)) = frames.first() {
+                    return Ok((frame.width, frame.height));
+                }
+            }
+            Err(error) => last = error,
+        }
+    }
+    Err(last)
 }
 
 fn base_stream(topic: &Topic, feature: &str, role: RoleSpec) -> (StreamSpec, Vec<String>) {
