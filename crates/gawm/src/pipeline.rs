@@ -61,6 +61,16 @@ pub enum PipelineError {
         /// The pipeline.
         path: PathBuf,
     },
+    /// A program would not take its section.
+    #[error("{path} [{section}]: {detail}")]
+    Section {
+        /// The pipeline.
+        path: PathBuf,
+        /// The section, or those that are read together.
+        section: &'static str,
+        /// What the program would say.
+        detail: String,
+    },
     /// A section that every pipeline needs is absent.
     #[error("{path}: section [{name}] is missing")]
     MissingSection {
@@ -105,6 +115,50 @@ impl Pipeline {
         self.document.contains_key(section)
     }
 
+    /// Checks every section as its program will: a typo in `[eval]` shows before a model is trained, not after.
+    ///
+    /// # Errors
+    ///
+    /// [`PipelineError::Section`] with what the first program says that would refuse its section.
+    pub fn check(&self) -> Result<(), PipelineError> {
+        let refuse = |section| {
+            let path = self.path.clone();
+            move |detail: String| PipelineError::Section { path, section, detail }
+        };
+        if let Some(section) = self.document.get("sim") {
+            let read: Result<gawm_sim::cli::SimConfig, _> = section.clone().try_into();
+            read.map_err(|error: toml::de::Error| refuse("sim")(error.message().to_owned()))?;
+        }
+        if self.has("ingest") {
+            gawm_ingest::contract::parse(&self.text_of(&["ingest"]), "ingest", &[])
+                .map_err(|error| refuse("ingest")(error.to_string()))?;
+        }
+        gawm_loader::LoaderConfig::from_pipeline(&self.text_of(&["loader"]), &[])
+            .map_err(|error| refuse("loader")(error.to_string()))?;
+        let trained = self.text_of(&["loader", "model", "objectives", "train"]);
+        gawm_train::config::Config::parse("trainer", &trained, &[])
+            .map_err(|error| refuse("model, objectives or train")(error.to_string()))?;
+        let eval = self.document.get("eval").and_then(toml::Value::as_table).cloned().unwrap_or_default();
+        gawm_eval::config::from_table("eval", eval).map_err(|error| refuse("eval")(error.to_string()))?;
+        Ok(())
+    }
+
+    /// Returns the pipeline for another folder: what its contract names relative to the file is named absolutely.
+    fn moved(&self) -> std::io::Result<Pipeline> {
+        let mut moved = self.clone();
+        let base = self.path.parent().unwrap_or(Path::new(""));
+        for name in contract_paths(&mut moved.document) {
+            *name = std::path::absolute(base.join(&*name))?.to_string_lossy().into_owned();
+        }
+        Ok(moved)
+    }
+
+    /// Returns the files and folders that the contract names.
+    fn contract_files(&self) -> Vec<PathBuf> {
+        let base = self.path.parent().unwrap_or(Path::new(""));
+        contract_paths(&mut self.document.clone()).into_iter().map(|name| base.join(&*name)).collect()
+    }
+
     /// Returns the text of these sections with overrides applied, for keys and for the resolved file.
     pub fn text_of(&self, sections: &[&str]) -> String {
         let part: toml::Table = self
@@ -115,6 +169,35 @@ impl Pipeline {
             .collect();
         toml::to_string(&part).expect("a table that was parsed from TOML can be written as TOML")
     }
+}
+
+/// The paths in `[ingest]`, relative to the file that the section stands in.
+fn contract_paths(document: &mut toml::Table) -> Vec<&mut String> {
+    let Some(toml::Value::Table(ingest)) = document.get_mut("ingest") else { return Vec::new() };
+    let mut names = Vec::new();
+    for (key, value) in ingest.iter_mut() {
+        let found = match key.as_str() {
+            "schemas" => value,
+            "task_schema" => match value.get_mut("file") {
+                Some(file) => file,
+                None => continue,
+            },
+            "labels" => match value.get_mut("side_file") {
+                Some(file) => file,
+                None => continue,
+            },
+            _ => continue,
+        };
+        match found {
+            toml::Value::String(name) => names.push(name),
+            toml::Value::Array(list) => names.extend(list.iter_mut().filter_map(|entry| match entry {
+                toml::Value::String(name) => Some(name),
+                _ => None,
+            })),
+            _ => {}
+        }
+    }
+    names
 }
 
 #[cfg(test)]
