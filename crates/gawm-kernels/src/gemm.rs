@@ -9,6 +9,8 @@
 
 use crate::simd::{Level, level};
 
+pub use crate::pack::{Packed, panel_width};
+
 /// The left operand, read element by element: `a(i, k) = values[i * row_stride + k * k_stride]`.
 #[derive(Debug, Clone, Copy)]
 pub struct Lhs<'a> {
@@ -48,114 +50,6 @@ pub const STORE: Epilogue<'static> = Epilogue { accumulate: false, bias: None };
 /// Adds to the output.
 pub const ACCUMULATE: Epilogue<'static> = Epilogue { accumulate: true, bias: None };
 
-/// A right operand in panels of [`panel_width`] columns: `[panels][k][width]`, the last one filled up with zeros.
-#[derive(Debug, Clone, Default)]
-pub struct Packed {
-    values: Vec<f32>,
-    width: usize,
-    k: usize,
-    n: usize,
-}
-
-impl Packed {
-    /// Packs `b(k, n) = values[k * k_stride + n * n_stride]`, reusing the memory of this panel.
-    ///
-    /// # Panics
-    ///
-    /// If `values` is too short.
-    pub fn fill(&mut self, values: &[f32], [k, n]: [usize; 2], [k_stride, n_stride]: [usize; 2]) {
-        let width = panel_width();
-        assert!(
-            k == 0 || n == 0 || (k - 1) * k_stride + (n - 1) * n_stride < values.len(),
-            "pack: too few values"
-        );
-        (self.width, self.k, self.n) = (width, k, n);
-        self.values.resize(n.div_ceil(width) * width * k, 0.0);
-        if k == 0 {
-            return;
-        }
-        for (panel, out) in self.values.chunks_exact_mut(width * k).enumerate() {
-            let first = panel * width;
-            let columns = width.min(n - first);
-            if n_stride == 1 {
-                for (row, out) in out.chunks_exact_mut(width).enumerate() {
-                    let start = row * k_stride + first;
-                    out[..columns].copy_from_slice(&values[start..start + columns]);
-                    out[columns..].fill(0.0);
-                }
-            } else if k_stride == 1 {
-                transpose(&values[first * n_stride..], n_stride, [columns, k], out, width);
-            } else {
-                for column in 0..columns {
-                    let source = values[(first + column) * n_stride..].iter().step_by(k_stride);
-                    for (out, value) in out[column..].iter_mut().step_by(width).zip(source) {
-                        *out = *value;
-                    }
-                }
-                for out in out.chunks_exact_mut(width) {
-                    out[columns..].fill(0.0);
-                }
-            }
-        }
-    }
-
-    /// Packs the transpose of a weight `[n, k]`, as [`Packed::fill`] does.
-    pub fn of_transposed(values: &[f32], [n, k]: [usize; 2]) -> Packed {
-        let mut packed = Packed::default();
-        packed.fill(values, [k, n], [1, k]);
-        packed
-    }
-
-    /// Packs a matrix `[k, n]`, as [`Packed::fill`] does.
-    pub fn of(values: &[f32], [k, n]: [usize; 2]) -> Packed {
-        let mut packed = Packed::default();
-        packed.fill(values, [k, n], [n, 1]);
-        packed
-    }
-
-    /// Number of columns, without the zeros of the last panel.
-    pub fn columns(&self) -> usize {
-        self.n
-    }
-}
-
-/// Writes the transpose of `rows` x `k` values, whose rows are `stride` apart, to rows of `width` elements; those beyond
-/// `rows` become zero.
-fn transpose(values: &[f32], stride: usize, [rows, k]: [usize; 2], out: &mut [f32], width: usize) {
-    let whole = rows - rows % 4;
-    for first in (0..whole).step_by(4) {
-        let row = |index: usize| values[(first + index) * stride..][..k].chunks_exact(4);
-        let tiles = row(0).zip(row(1)).zip(row(2)).zip(row(3));
-        for ((((a, b), c), d), out) in tiles.zip(out.chunks_exact_mut(4 * width)) {
-            // Four by four, which becomes shuffles of registers.
-            for lane in 0..4 {
-                let target = &mut out[lane * width + first..][..4];
-                target.copy_from_slice(&[a[lane], b[lane], c[lane], d[lane]]);
-            }
-        }
-        for kk in k - k % 4..k {
-            for index in 0..4 {
-                out[kk * width + first + index] = values[(first + index) * stride + kk];
-            }
-        }
-    }
-    for (kk, out) in out.chunks_exact_mut(width).enumerate() {
-        for (index, out) in out[whole..rows].iter_mut().enumerate() {
-            *out = values[(whole + index) * stride + kk];
-        }
-        out[rows..].fill(0.0);
-    }
-}
-
-/// Number of columns of a register tile at the level in use.
-pub fn panel_width() -> usize {
-    match level() {
-        Level::Avx512 => 32,
-        Level::Avx2 => 16,
-        Level::Portable => 8,
-    }
-}
-
 /// Computes `C = A B`, with `C [m, n]` in rows of `c_stride` elements and a sum over `k` terms.
 ///
 /// # Panics
@@ -187,7 +81,7 @@ pub fn gemm(
             assert!((k - 1) * stride + n <= values.len(), "gemm: right operand is too short");
         }
         Rhs::Packed(packed) => {
-            let fits = (packed.width, packed.k) == (width, k) && n * k <= packed.values.len();
+            let fits = packed.fits(k, n);
             assert!(fits, "gemm: packed for other sizes");
         }
     }
@@ -198,7 +92,7 @@ pub fn gemm(
     {
         rest.fill(&values[n - n % width..], [k, n % width], [stride, 1]);
     }
-    let job = Job { m, n, k, a, b, rest: &rest.values, c: c.as_mut_ptr(), c_stride, epilogue };
+    let job = Job { m, n, k, a, b, rest: rest.values(), c: c.as_mut_ptr(), c_stride, epilogue };
     match level() {
         // SAFETY: AVX-512 F is there at this level; the assertions above are the preconditions of `Job::run`.
         #[cfg(target_arch = "x86_64")]
@@ -252,7 +146,7 @@ impl Job<'_> {
         for first in (0..self.n).step_by(width) {
             let columns = width.min(self.n - first);
             let (b, stride) = match self.b {
-                Rhs::Packed(packed) => (packed.values[first * self.k..].as_ptr(), width),
+                Rhs::Packed(packed) => (packed.values()[first * self.k..].as_ptr(), width),
                 Rhs::Rows { values, stride } if columns == width => (values[first..].as_ptr(), stride),
                 Rhs::Rows { .. } => (self.rest.as_ptr(), width),
             };
@@ -369,34 +263,81 @@ impl Tile<'_> {
     #[inline(always)]
     unsafe fn write<V: Vector, const ROWS: usize, const VECTORS: usize>(&self, sums: &[[V; VECTORS]; ROWS]) {
         let Epilogue { accumulate, bias } = self.job.epilogue;
-        let whole = self.columns == VECTORS * V::LANES;
-        for (i, sums) in sums.iter().enumerate() {
-            // SAFETY: row + i < m and first + columns <= n, so that the row of C holds `columns` elements from here on,
-            // and so does the bias; whole vectors are only read and written when `columns` fills them. The spill is
-            // 32 elements wide, as the widest tile.
-            unsafe {
-                let c = self.job.c.add((self.row + i) * self.job.c_stride + self.first);
-                if whole {
-                    for (v, sum) in sums.iter().enumerate() {
-                        let mut value = *sum;
-                        if let Some(bias) = bias {
-                            value = V::add(value, V::load(bias.as_ptr().add(self.first + v * V::LANES)));
-                        }
-                        let c = c.add(v * V::LANES);
-                        if accumulate {
-                            value = V::add(value, V::load(c));
-                        }
-                        V::store(value, c);
-                    }
-                } else {
-                    let mut spill = [0f32; WIDEST];
-                    for (v, sum) in sums.iter().enumerate() {
-                        V::store(*sum, spill.as_mut_ptr().add(v * V::LANES));
-                    }
-                    for (column, value) in spill[..self.columns].iter().enumerate() {
-                        let kept = if accumulate { *c.add(column) } else { 0.0 };
-                        *c.add(column) = kept + (value + bias.map_or(0.0, |bias| bias[self.first + column]));
-                    }
+        // SAFETY: row + i < m and first + columns <= n, so that each row of C holds `columns` elements from here on, and
+        // so does the bias; whole vectors are only read and written when `columns` fills them.
+        unsafe {
+            let c = self.job.c.add(self.row * self.job.c_stride + self.first);
+            if self.columns != VECTORS * V::LANES {
+                return self.write_part(sums, c);
+            }
+            let mut shift = [V::zero(); VECTORS];
+            if let Some(bias) = bias {
+                for (v, shift) in shift.iter_mut().enumerate() {
+                    *shift = V::load(bias.as_ptr().add(self.first + v * V::LANES));
+                }
+            }
+            // Three loops and not one with branches inside: unrolled, they leave the sums in their registers.
+            match (accumulate, bias.is_some()) {
+                (false, false) => self.store_rows(sums, c, |sum, _, _| sum),
+                (true, false) => self.store_rows(sums, c, |sum, _, c| V::add(sum, V::load(c))),
+                (false, true) => self.store_rows(sums, c, |sum, v, _| V::add(sum, shift[v])),
+                (true, true) => self.store_rows(sums, c, |sum, v, c| V::add(V::add(sum, shift[v]), V::load(c))),
+            }
+        }
+    }
+
+    /// Writes `value(sum, index of the vector, where it goes)` for every sum.
+    ///
+    /// # Safety
+    ///
+    /// `c` is followed by as many elements as the rows of whole vectors have, each `c_stride` after the last; the rest is
+    /// as for [`Tile::run`].
+    #[inline(always)]
+    unsafe fn store_rows<V: Vector, const ROWS: usize, const VECTORS: usize>(
+        &self,
+        sums: &[[V; VECTORS]; ROWS],
+        mut c: *mut f32,
+        value: impl Fn(V, usize, *const f32) -> V,
+    ) {
+        for sums in sums {
+            for (v, sum) in sums.iter().enumerate() {
+                // SAFETY: the caller's promise.
+                unsafe {
+                    let c = c.add(v * V::LANES);
+                    V::store(value(*sum, v, c), c);
+                }
+            }
+            // Wrapping, since the step after the last row may leave the output; it is not written there.
+            c = c.wrapping_add(self.job.c_stride);
+        }
+    }
+
+    /// Writes a tile of which only some columns belong to the output, which begins at `c`.
+    ///
+    /// # Safety
+    ///
+    /// As [`Tile::run`].
+    #[inline(always)]
+    unsafe fn write_part<V: Vector, const ROWS: usize, const VECTORS: usize>(
+        &self,
+        sums: &[[V; VECTORS]; ROWS],
+        c: *mut f32,
+    ) {
+        let mut spill = [[0f32; WIDEST]; ROWS];
+        for (spill, sums) in spill.iter_mut().zip(sums) {
+            for (v, sum) in sums.iter().enumerate() {
+                // SAFETY: the spill is 32 elements wide, as the widest tile.
+                unsafe { V::store(*sum, spill.as_mut_ptr().add(v * V::LANES)) };
+            }
+        }
+        let Epilogue { accumulate, bias } = self.job.epilogue;
+        for (i, spill) in spill.iter().enumerate() {
+            for (column, value) in spill[..self.columns].iter().enumerate() {
+                // SAFETY: row + i < m and first + columns <= n.
+                unsafe {
+                    let c = c.add(i * self.job.c_stride + column);
+                    let kept = if accumulate { *c } else { 0.0 };
+                    *c = kept + (value + bias.map_or(0.0, |bias| bias[self.first + column]));
                 }
             }
         }

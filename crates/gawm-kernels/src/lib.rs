@@ -30,6 +30,7 @@ pub mod memory;
 pub mod profile;
 
 pub mod gemm;
+mod pack;
 
 pub mod attention;
 pub mod gelu;
