@@ -281,7 +281,9 @@ impl Tile<'_> {
                 (false, false) => self.store_rows(sums, c, |sum, _, _| sum),
                 (true, false) => self.store_rows(sums, c, |sum, _, c| V::add(sum, V::load(c))),
                 (false, true) => self.store_rows(sums, c, |sum, v, _| V::add(sum, shift[v])),
-                (true, true) => self.store_rows(sums, c, |sum, v, c| V::add(V::add(sum, shift[v]), V::load(c))),
+                (true, true) => {
+                    self.store_rows(sums, c, |sum, v, c| V::add(V::add(sum, shift[v]), V::load(c)))
+                }
             }
         }
     }

@@ -7,6 +7,8 @@
 //! |---|---|---|
 //! | transformer from frames to class tokens | [`vit::Vit`] | [`VitEncoder`] |
 //! | latents under actions, for planners | [`rollout::Rollout`] | [`rollout::Roller`] |
+//! | predictor in training | [`predictor::PredictorShape`] | [`predictor::Predictor`] |
+//! | projectors and heads | [`head::HeadShape`] | [`head::Head`] |
 //! | linear layers | [`linear::LinearShape`] | [`linear::linear`] |
 //! | AdamW with clipping | [`adamw::update`] | [`adamw::adamw`], [`adamw::squared_norm`] |
 //! | bytes to standardised planes | | [`pixels::standardize`] |
@@ -41,9 +43,12 @@ pub mod vit;
 mod adapter;
 
 pub mod adamw;
+pub mod head;
 pub mod linear;
 pub mod pixels;
+pub mod predictor;
 pub mod rollout;
+mod rows;
 
 pub use adapter::{GradientSink, VitEncoder};
 pub use simd::{Level, detect, level, limit_level};

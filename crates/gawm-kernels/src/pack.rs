@@ -95,13 +95,7 @@ pub fn panel_width() -> usize {
 const SQUARE: usize = 8;
 
 /// Writes the transpose of `rows` x `k` values, whose rows are `stride` apart, to rows of `width` elements.
-pub(crate) fn transpose(
-    values: &[f32],
-    stride: usize,
-    [rows, k]: [usize; 2],
-    out: &mut [f32],
-    width: usize,
-) {
+pub(crate) fn transpose(values: &[f32], stride: usize, [rows, k]: [usize; 2], out: &mut [f32], width: usize) {
     if rows == 0 || k == 0 {
         return;
     }

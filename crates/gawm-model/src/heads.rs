@@ -1,22 +1,28 @@
 //! The heads of training: G reads the physical state from latents, H the action between them.
 
 use candle_core::{D, Tensor};
+use gawm_kernels::head::{Head as FusedHead, HeadNorm};
 
 use crate::Result;
 use crate::config::{Architecture, InverseInput};
 use crate::layers::{LayerNorm, Linear, gelu};
 use crate::parameters::{Parameters, Specs};
-use crate::pass::Pass;
+use crate::pass::{Pass, Precision};
+use crate::projector::fused_head;
 
 /// `Linear -> LayerNorm -> GELU -> Linear`.
 #[derive(Debug, Clone)]
 struct Head {
+    /// All of it in one operation, for training; the rest is the composed form of the same.
+    fused: FusedHead,
     expand: Linear,
     norm: LayerNorm,
     contract: Linear,
 }
 
 impl Head {
+    const EPSILON: f64 = 1e-5;
+
     fn specs(specs: &mut Specs, name: &str, inputs: usize, hidden: usize, outputs: usize) {
         Linear::specs(specs, &format!("{name}.net.0"), inputs, hidden);
         LayerNorm::specs(specs, &format!("{name}.net.1"), hidden);
@@ -25,13 +31,23 @@ impl Head {
 
     fn load(parameters: &Parameters, name: &str) -> Result<Head> {
         Ok(Head {
+            fused: fused_head(parameters, name, HeadNorm::Layer, Head::EPSILON)?,
             expand: Linear::load(parameters, &format!("{name}.net.0"))?,
-            norm: LayerNorm::load(parameters, &format!("{name}.net.1"), 1e-5)?,
+            norm: LayerNorm::load(parameters, &format!("{name}.net.1"), Head::EPSILON)?,
             contract: Linear::load(parameters, &format!("{name}.net.3"))?,
         })
     }
 
+    /// Maps [.., inputs] to [.., outputs].
     fn forward(&self, x: &Tensor, pass: &Pass) -> Result<Tensor> {
+        if pass.training && pass.precision == Precision::F32 && self.fused.takes(x) {
+            let mut dims = x.dims().to_vec();
+            let (y, _) = self.fused.forward(&x.flatten_to(D::Minus2)?)?;
+            if let Some(last) = dims.last_mut() {
+                *last = y.dim(1)?;
+            }
+            return y.reshape(dims); // [.., outputs]
+        }
         let x = self.norm.forward(&self.expand.forward(x, pass)?)?;
         self.contract.forward(&gelu(&x)?, pass)
     }

@@ -1,15 +1,18 @@
 //! The projectors: an MLP with batch norm, after the encoder and after the predictor.
 
 use candle_core::Tensor;
+use gawm_kernels::head::{Head, HeadNorm};
 
 use crate::Result;
 use crate::layers::{BatchNorm, Linear, gelu};
 use crate::parameters::{Parameters, Specs};
-use crate::pass::Pass;
+use crate::pass::{Pass, Precision};
 
 /// `Linear -> BatchNorm -> GELU -> Linear`.
 #[derive(Debug, Clone)]
 pub struct Projector {
+    /// All of it in one operation, for training; the rest is the composed form of the same.
+    fused: Head,
     expand: Linear,
     norm: BatchNorm,
     contract: Linear,
@@ -26,6 +29,7 @@ impl Projector {
     /// Takes the tensors under `name` from the store.
     pub fn load(parameters: &Parameters, name: &str) -> Result<Projector> {
         Ok(Projector {
+            fused: fused_head(parameters, name, HeadNorm::Batch, BatchNorm::EPSILON)?,
             expand: Linear::load(parameters, &format!("{name}.net.0"))?,
             norm: BatchNorm::load(parameters, &format!("{name}.net.1"))?,
             contract: Linear::load(parameters, &format!("{name}.net.3"))?,
@@ -34,7 +38,29 @@ impl Projector {
 
     /// Maps rows [N, inputs] to [N, outputs]. In training the batch statistics run over all N rows.
     pub fn forward(&self, x: &Tensor, pass: &Pass) -> Result<Tensor> {
+        let rows = x.dim(0)?;
+        if pass.training && pass.precision == Precision::F32 && rows > 1 && self.fused.takes(x) {
+            let (y, statistics) = self.fused.forward(x)?;
+            if let Some([mean, variance]) = statistics {
+                self.norm.track(&mean, &variance, rows)?;
+            }
+            return Ok(y); // [N, outputs]
+        }
         let x = self.norm.forward(&self.expand.forward(x, pass)?, pass)?;
         self.contract.forward(&gelu(&x)?, pass)
     }
+}
+
+/// Hands the parameters of `Linear -> norm -> GELU -> Linear` under `name` to the fused form of it.
+pub(crate) fn fused_head(parameters: &Parameters, name: &str, norm: HeadNorm, epsilon: f64) -> Result<Head> {
+    let tensor = |part: &str| parameters.get(&format!("{name}.net.{part}"));
+    let tensors = [
+        tensor("0.weight")?,
+        tensor("0.bias")?,
+        tensor("1.weight")?,
+        tensor("1.bias")?,
+        tensor("3.weight")?,
+        tensor("3.bias")?,
+    ];
+    Ok(Head::new(tensors, parameters.sink().clone(), norm, epsilon))
 }
