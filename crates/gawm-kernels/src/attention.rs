@@ -104,7 +104,8 @@ impl Attention {
                 gemm([rows, padded, d], q, Rhs::Packed(&scratch.keys), &mut scratch.scores, padded, STORE);
                 let sums = &mut log_sums[head * self.queries + start..][..rows];
                 let weights = &mut scratch.scores[..rows * padded];
-                softmax_rows(weights, [padded, self.keys], self.scale(), sums, &mut scratch.products);
+                let inverses = &mut scratch.products[..rows];
+                softmax_rows(weights, [padded, self.keys], self.scale(), sums, inverses);
                 let p = Lhs { values: &scratch.scores, row_stride: padded, k_stride: 1 };
                 let v = Rhs::Rows { values: &inputs.v[first..], stride: width };
                 let output = &mut output[start * width + first..];
@@ -208,26 +209,31 @@ vectorized! {
         inverses: &mut [f32],
     ) {
         let [stride, count] = sizes;
-        let rows = scores.chunks_exact_mut(stride).zip(log_sums).zip(inverses);
-        for ((row, log_sum), inverse) in rows {
+        // Row after row in each pass, so that the end of one row's reduction overlaps with the next row.
+        for (row, largest) in scores.chunks_exact_mut(stride).zip(inverses.iter_mut()) {
             // Beyond the last key too, so that whole vectors are left.
             row[count..].fill(f32::NEG_INFINITY);
-            let largest = max_of(row);
+            *largest = max_of(row);
+        }
+        let rows = scores.chunks_exact_mut(stride).zip(inverses.iter_mut()).zip(log_sums.iter_mut());
+        for ((row, inverse), log_sum) in rows {
+            let largest = *inverse;
+            let one = |x: &mut f32, lane: &mut f32| {
+                *x = exp::<FMA>((*x - largest) * scale);
+                *lane += *x;
+            };
             let mut lanes = [0f32; LANES];
             let (vectors, rest) = row.as_chunks_mut::<LANES>();
             for vector in vectors {
-                for (x, lane) in vector.iter_mut().zip(&mut lanes) {
-                    *x = exp::<FMA>((*x - largest) * scale);
-                    *lane += *x;
-                }
+                vector.iter_mut().zip(&mut lanes).for_each(|(x, lane)| one(x, lane));
             }
-            for (x, lane) in rest.iter_mut().zip(&mut lanes) {
-                *x = exp::<FMA>((*x - largest) * scale);
-                *lane += *x;
-            }
-            let total = fold(lanes, |a, b| a + b);
-            *inverse = 1.0 / total;
-            *log_sum = mul_add::<FMA>(largest, scale, total.ln());
+            rest.iter_mut().zip(&mut lanes).for_each(|(x, lane)| one(x, lane));
+            *inverse = fold(lanes, |a, b| a + b);
+            *log_sum = largest * scale;
+        }
+        for (log_sum, inverse) in log_sums.iter_mut().zip(inverses.iter_mut()) {
+            *log_sum += inverse.ln();
+            *inverse = 1.0 / *inverse;
         }
     }
 
