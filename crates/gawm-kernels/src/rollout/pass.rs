@@ -1,8 +1,8 @@
 //! The roll-out of a group of sequences on one thread.
 
 use super::RolloutShape;
-use super::weights::{Block, Linear, Norm, Packs};
-use crate::gelu::gelu;
+use super::weights::{Block, Linear, Mlp, Norm, Packs};
+use crate::gelu::gelu_in_place;
 use crate::gemm::{Epilogue, Lhs, Rhs, gemm};
 use crate::norm;
 use crate::profile::{Kind, span};
@@ -130,6 +130,12 @@ impl Pass<'_> {
         let y = sized(&mut scratch.y, n * count * d);
         self.modulated_norm(&scratch.x, &scratch.modulations[index], (tokens, count), 0, &block.attn_norm, y);
         for (layer, cache) in [(&block.k, &mut scratch.keys[index]), (&block.v, &mut scratch.values[index])] {
+            // Rows of equal distance go straight to their places.
+            if count == 1 || count == history {
+                let stride = if count == 1 { history * inner } else { inner };
+                linear_to(layer, y, [n * count, d], &mut cache[tokens.first * inner..], stride, false);
+                continue;
+            }
             let fresh = sized(&mut scratch.fresh, n * count * inner);
             linear(layer, y, [n * count, d], fresh, false);
             let caches = cache.chunks_exact_mut(history * inner);
@@ -161,27 +167,20 @@ impl Pass<'_> {
         linear(&block.output, attended, [n * kept, inner], y, false);
         self.add_gated(y, &scratch.modulations[index], (tokens, kept), 2, x);
         self.modulated_norm(x, &scratch.modulations[index], (tokens, kept), 3, &block.mlp_norm, y);
-        let hidden = sized(&mut scratch.hidden, n * kept * block.expand.outputs);
-        let activated = sized(&mut scratch.fresh, n * kept * block.expand.outputs);
-        linear(&block.expand, y, [n * kept, d], hidden, false);
-        span(Kind::Gelu, 0, || gelu(hidden, activated));
-        linear(&block.contract, activated, [n * kept, block.expand.outputs], y, false);
+        mlp(&block.mlp, y, n * kept, &mut scratch.hidden, &mut scratch.z);
+        let y = &scratch.z[..n * kept * d];
         self.add_gated(y, &scratch.modulations[index], (tokens, kept), 5, x);
     }
 
     /// Maps the last token of each sequence to the next latent.
     fn project(&self, tokens: Tokens, scratch: &mut Scratch) {
         let (d, n) = (self.shape.latent, self.n);
-        let hidden_width = self.packs.project.outputs;
         let (x, y) = (&scratch.x[..n * d], sized(&mut scratch.y, n * d));
         let (normal, rstd) = (sized(&mut scratch.z, n * d), sized(&mut scratch.rstd, n));
         norm::normalize(x, d, self.shape.affine_epsilon, normal, rstd);
         norm::scale_shift(normal, &self.packs.norm.weight, &self.packs.norm.bias, y);
-        let hidden = sized(&mut scratch.hidden, n * hidden_width);
-        let activated = sized(&mut scratch.fresh, n * hidden_width);
-        linear(&self.packs.project, y, [n, d], hidden, false);
-        span(Kind::Gelu, 0, || gelu(hidden, activated));
-        linear(&self.packs.finish, activated, [n, hidden_width], y, false);
+        mlp(&self.packs.project, y, n, &mut scratch.hidden, &mut scratch.z);
+        let y = &scratch.z[..n * self.packs.project.outputs];
         let next = (tokens.start + tokens.first + tokens.count) * d;
         for (latents, y) in scratch.latents.chunks_exact_mut((self.chunks + 1) * d).zip(y.chunks_exact(d)) {
             latents[next..next + d].copy_from_slice(y);
@@ -227,30 +226,52 @@ impl Pass<'_> {
         let d = self.shape.latent;
         for (row, (x, y)) in x.chunks_exact_mut(d).zip(y.chunks_exact(d)).enumerate() {
             let gate = &self.modulation(modulations, tokens, kept, row)[part * d..][..d];
-            for ((x, y), gate) in x.iter_mut().zip(y).zip(gate) {
-                *x += gate * y;
-            }
+            add_gated_row(y, gate, x);
         }
     }
 }
 
 /// `out = x W^T + b`, or added to `out`; `x` has rows of `stride` elements, of which the layer reads its inputs.
-fn linear(layer: &Linear, x: &[f32], [rows, stride]: [usize; 2], out: &mut [f32], accumulate: bool) {
+fn linear(layer: &Linear, x: &[f32], sizes: [usize; 2], out: &mut [f32], accumulate: bool) {
+    linear_to(layer, x, sizes, out, layer.outputs, accumulate);
+}
+
+/// [`linear`] to rows that are `out_stride` apart.
+fn linear_to(
+    layer: &Linear,
+    x: &[f32],
+    [rows, stride]: [usize; 2],
+    out: &mut [f32],
+    out_stride: usize,
+    accumulate: bool,
+) {
     let a = Lhs { values: x, row_stride: stride, k_stride: 1 };
     let epilogue = Epilogue { accumulate, bias: layer.bias.as_deref() };
+    let sizes = [rows, layer.outputs, layer.inputs];
     span(Kind::LinearForward, 2 * rows * layer.outputs * layer.inputs, || {
-        gemm(
-            [rows, layer.outputs, layer.inputs],
-            a,
-            Rhs::Packed(&layer.weight),
-            out,
-            layer.outputs,
-            epilogue,
-        );
+        gemm(sizes, a, Rhs::Packed(&layer.weight), out, out_stride, epilogue);
     });
 }
 
+/// `out = mlp(x)`, block by block of hidden columns; `x` [rows, inputs], `hidden` and `out` grow as needed.
+fn mlp(mlp: &Mlp, x: &[f32], rows: usize, hidden: &mut Vec<f32>, out: &mut Vec<f32>) {
+    let out = sized(out, rows * mlp.outputs);
+    for (index, [up, down]) in mlp.blocks.iter().enumerate() {
+        let hidden = sized(hidden, rows * up.outputs);
+        linear(up, x, [rows, up.inputs], hidden, false);
+        span(Kind::Gelu, 0, || gelu_in_place(hidden));
+        linear(down, hidden, [rows, down.inputs], out, index > 0);
+    }
+}
+
 vectorized! {
+    /// `x += gate * y`.
+    fn add_gated_row(y: &[f32], gate: &[f32], x: &mut [f32]) {
+        for ((x, y), gate) in x.iter_mut().zip(y).zip(gate) {
+            *x = mul_add::<FMA>(*gate, *y, *x);
+        }
+    }
+
     /// `x / (1 + exp(-x))`, in place.
     fn silu(x: &mut [f32]) {
         for x in x.iter_mut() {
