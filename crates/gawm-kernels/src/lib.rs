@@ -28,7 +28,6 @@
 
 mod simd;
 
-pub mod memory;
 pub mod profile;
 
 pub mod gemm;

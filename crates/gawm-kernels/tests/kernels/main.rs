@@ -2,8 +2,11 @@
 #![expect(clippy::unwrap_used, reason = "a test ends where its helper does")]
 
 mod attention;
+mod composed;
 mod gemm;
+mod head;
 mod linear;
 mod pointwise;
+mod predictor;
 mod reference;
 mod vit;
