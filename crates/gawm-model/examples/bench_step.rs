@@ -130,7 +130,8 @@ fn cpu_secs() -> anyhow::Result<f64> {
     for task in std::fs::read_dir("/proc/self/task")? {
         let path = task?.path().join("schedstat");
         let text = std::fs::read_to_string(&path)?;
-        let first = text.split_whitespace().next().with_context(|| format!("{}: is empty", path.display()))?;
+        let first =
+            text.split_whitespace().next().with_context(|| format!("{}: is empty", path.display()))?;
         nanoseconds += first.parse::<u64>()?;
     }
     Ok(nanoseconds as f64 * 1e-9)

@@ -48,6 +48,11 @@ impl Head {
             }
             return y.reshape(dims); // [.., outputs]
         }
+        self.forward_composed(x, pass)
+    }
+
+    /// [`Head::forward`] in composed operations.
+    fn forward_composed(&self, x: &Tensor, pass: &Pass) -> Result<Tensor> {
         let x = self.norm.forward(&self.expand.forward(x, pass)?)?;
         self.contract.forward(&gelu(&x)?, pass)
     }
@@ -108,5 +113,30 @@ impl InverseDynamics {
             InverseInput::Difference => (to - from)?,
         };
         self.head.forward(&input, pass) // [B, T-1, A]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::Device;
+
+    use super::*;
+    use crate::random::Stream;
+
+    #[test]
+    fn fused_and_composed_heads_agree() {
+        let mut specs = Specs::new();
+        Head::specs(&mut specs, "h", 6, 20, 3);
+        let head = Head::load(&Parameters::init(&specs, 2, &Device::Cpu).unwrap(), "h").unwrap();
+        for shape in [[1, 1, 6], [2, 3, 6], [300, 3, 6]] {
+            let x = Stream::new(1, "x", 0).normals(shape.iter().product());
+            let x = Tensor::from_vec(x, &shape, &Device::Cpu).unwrap();
+            let fused = head.forward(&x, &Pass::train(0, 0)).unwrap();
+            let composed = head.forward_composed(&x, &Pass::train(0, 0)).unwrap();
+            assert_eq!(fused.dims(), [shape[0], shape[1], 3]);
+            let worst =
+                (fused - composed).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+            assert!(worst < 1e-5, "{shape:?}: {worst}");
+        }
     }
 }

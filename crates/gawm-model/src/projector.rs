@@ -46,6 +46,11 @@ impl Projector {
             }
             return Ok(y); // [N, outputs]
         }
+        self.forward_composed(x, pass)
+    }
+
+    /// [`Projector::forward`] in composed operations.
+    fn forward_composed(&self, x: &Tensor, pass: &Pass) -> Result<Tensor> {
         let x = self.norm.forward(&self.expand.forward(x, pass)?, pass)?;
         self.contract.forward(&gelu(&x)?, pass)
     }
@@ -63,4 +68,51 @@ pub(crate) fn fused_head(parameters: &Parameters, name: &str, norm: HeadNorm, ep
         tensor("3.bias")?,
     ];
     Ok(Head::new(tensors, parameters.sink().clone(), norm, epsilon))
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::{DType, Device};
+
+    use super::*;
+    use crate::random::Stream;
+
+    #[test]
+    fn fused_and_composed_projectors_agree_in_training() {
+        for rows in [2, 3, 300] {
+            let mut specs = Specs::new();
+            Projector::specs(&mut specs, "p", 5, 70, 3);
+            let x = Stream::new(1, "x", 0).normals(rows * 5);
+            let x = Tensor::from_vec(x, (rows, 5), &Device::Cpu).unwrap();
+            let run = |composed: bool| {
+                let parameters = Parameters::init(&specs, 2, &Device::Cpu).unwrap();
+                let projector = Projector::load(&parameters, "p").unwrap();
+                let pass = Pass::train(0, 0);
+                let y = match composed {
+                    true => projector.forward_composed(&x, &pass),
+                    false => projector.forward(&x, &pass),
+                };
+                let moved = ["running_mean", "running_var", "num_batches_tracked"].map(|name| {
+                    parameters.get(&format!("p.net.1.{name}")).unwrap().to_dtype(DType::F32).unwrap()
+                });
+                let mut values = y.unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+                values.extend(moved.iter().flat_map(|t| t.flatten_all().unwrap().to_vec1::<f32>().unwrap()));
+                values
+            };
+            for (fused, composed) in run(false).iter().zip(run(true)) {
+                assert!((fused - composed).abs() < 1e-5, "{rows} rows: {fused} {composed}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_single_row_is_refused_in_training() {
+        let mut specs = Specs::new();
+        Projector::specs(&mut specs, "p", 5, 7, 3);
+        let projector = Projector::load(&Parameters::init(&specs, 2, &Device::Cpu).unwrap(), "p").unwrap();
+        let x = Tensor::ones((1, 5), DType::F32, &Device::Cpu).unwrap();
+        let error = projector.forward(&x, &Pass::train(0, 0)).unwrap_err().to_string();
+        assert!(error.contains("at least 2 rows"), "{error}");
+        assert!(projector.forward(&x, &Pass::eval()).is_ok());
+    }
 }

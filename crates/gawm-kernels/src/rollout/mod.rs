@@ -88,7 +88,7 @@ impl Rollout {
             "rollout: sizes of latents, actions and output"
         );
         // As many groups for every thread, and all of about one size.
-        let groups = n.div_ceil(GROUP).next_multiple_of(rayon::current_num_threads());
+        let groups = n.div_ceil(GROUP).max(1).next_multiple_of(rayon::current_num_threads());
         let group = n.div_ceil(groups).max(1);
         let inputs = z.par_chunks(group * frames * latent).zip(actions.par_chunks(group * chunks * action));
         output.par_chunks_mut(group * steps * latent).zip(inputs).for_each(|(output, (z, actions))| {

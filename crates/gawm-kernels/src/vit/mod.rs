@@ -165,7 +165,7 @@ impl Vit {
         span(Kind::Packing, 0, || packs.pack_backward(shape, parameters));
         let VitState(mut states) = state;
         let n_chunks = states.len();
-        let per_group = n_chunks.div_ceil(GROUPS.min(n_chunks)).max(1);
+        let per_group = n_chunks.div_ceil(GROUPS).max(1);
         let groups: Vec<Vec<f32>> = states
             .par_chunks_mut(per_group)
             .enumerate()
