@@ -8,6 +8,9 @@
 //! (A is never copied), a row of B is two vectors, either from a matrix or from a panel made by [`Packed`].
 
 use crate::simd::{Level, level};
+#[cfg(target_arch = "x86_64")]
+use crate::vector::x86;
+use crate::vector::{Four, Vector};
 
 pub use crate::pack::{Packed, panel_width};
 
@@ -63,6 +66,44 @@ pub fn gemm(
     c_stride: usize,
     epilogue: Epilogue<'_>,
 ) {
+    product([m, n, k], a, b, c, c_stride, epilogue, Terms::Single);
+}
+
+/// [`gemm`] of operands in pairs ([`crate::pairs`]): `k` counts pairs.
+///
+/// # Panics
+///
+/// As [`gemm`], and if the processor has no such instruction ([`crate::pairs::available`]).
+pub fn gemm_pairs(
+    sizes: [usize; 3],
+    a: Lhs<'_>,
+    b: Rhs<'_>,
+    c: &mut [f32],
+    c_stride: usize,
+    epilogue: Epilogue<'_>,
+) {
+    assert!(crate::pairs::available(), "gemm: expected a processor with avx512_bf16");
+    product(sizes, a, b, c, c_stride, epilogue, Terms::Pairs);
+}
+
+/// What an element of an operand holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Terms {
+    /// A value.
+    Single,
+    /// Two values in bf16.
+    Pairs,
+}
+
+fn product(
+    [m, n, k]: [usize; 3],
+    a: Lhs<'_>,
+    b: Rhs<'_>,
+    c: &mut [f32],
+    c_stride: usize,
+    epilogue: Epilogue<'_>,
+    terms: Terms,
+) {
     if m == 0 || n == 0 {
         return;
     }
@@ -94,6 +135,9 @@ pub fn gemm(
     }
     let job = Job { m, n, k, a, b, rest: rest.values(), c: c.as_mut_ptr(), c_stride, epilogue };
     match level() {
+        // SAFETY: `gemm_pairs` found the instruction; the assertions above are the preconditions of `Job::run`.
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512 if terms == Terms::Pairs => unsafe { run_pairs(&job) },
         // SAFETY: AVX-512 F is there at this level; the assertions above are the preconditions of `Job::run`.
         #[cfg(target_arch = "x86_64")]
         Level::Avx512 => unsafe { run_avx512(&job) },
@@ -346,150 +390,6 @@ impl Tile<'_> {
     }
 }
 
-/// A vector register.
-trait Vector: Copy {
-    /// Elements of a register.
-    const LANES: usize;
-    /// Rows of a tile: as many as leave registers for B and a broadcast, and at most 12.
-    const ROWS: usize;
-    /// # Safety
-    ///
-    /// Needs the instructions of the type.
-    unsafe fn zero() -> Self;
-    /// # Safety
-    ///
-    /// Needs the instructions of the type, and `LANES` elements to read.
-    unsafe fn load(from: *const f32) -> Self;
-    /// # Safety
-    ///
-    /// Needs the instructions of the type, and `LANES` elements to write.
-    unsafe fn store(self, to: *mut f32);
-    /// # Safety
-    ///
-    /// Needs the instructions of the type.
-    unsafe fn splat(value: f32) -> Self;
-    /// # Safety
-    ///
-    /// Needs the instructions of the type.
-    unsafe fn mul_add(self, b: Self, c: Self) -> Self;
-    /// # Safety
-    ///
-    /// Needs the instructions of the type.
-    unsafe fn add(self, b: Self) -> Self;
-}
-
-/// Four lanes that every target has.
-#[derive(Clone, Copy)]
-struct Four([f32; 4]);
-
-impl Vector for Four {
-    const LANES: usize = 4;
-    const ROWS: usize = 4;
-    #[inline(always)]
-    unsafe fn zero() -> Self {
-        Four([0.0; 4])
-    }
-    #[inline(always)]
-    unsafe fn load(from: *const f32) -> Self {
-        // SAFETY: the caller has four elements to read; the type has the alignment of its elements.
-        Four(unsafe { from.cast::<[f32; 4]>().read() })
-    }
-    #[inline(always)]
-    unsafe fn store(self, to: *mut f32) {
-        // SAFETY: the caller has four elements to write; the type has the alignment of its elements.
-        unsafe { to.cast::<[f32; 4]>().write(self.0) }
-    }
-    #[inline(always)]
-    unsafe fn splat(value: f32) -> Self {
-        Four([value; 4])
-    }
-    #[inline(always)]
-    unsafe fn mul_add(self, b: Self, c: Self) -> Self {
-        Four(std::array::from_fn(|i| self.0[i] * b.0[i] + c.0[i]))
-    }
-    #[inline(always)]
-    unsafe fn add(self, b: Self) -> Self {
-        Four(std::array::from_fn(|i| self.0[i] + b.0[i]))
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-mod x86 {
-    use std::arch::x86_64::*;
-
-    use super::Vector;
-
-    /// Implements [`Vector`] by the intrinsics of one set of instructions.
-    macro_rules! vector {
-        ($name:ident, $register:ty, $lanes:literal, $rows:literal, $zero:ident, $load:ident, $store:ident, $splat:ident, $fma:ident, $add:ident) => {
-            #[derive(Clone, Copy)]
-            pub(super) struct $name($register);
-
-            impl Vector for $name {
-                const LANES: usize = $lanes;
-                const ROWS: usize = $rows;
-                #[inline(always)]
-                unsafe fn zero() -> Self {
-                    // SAFETY: the caller has these instructions.
-                    $name(unsafe { $zero() })
-                }
-                #[inline(always)]
-                unsafe fn load(from: *const f32) -> Self {
-                    // SAFETY: the caller has these instructions and the elements; the load needs no alignment.
-                    $name(unsafe { $load(from) })
-                }
-                #[inline(always)]
-                unsafe fn store(self, to: *mut f32) {
-                    // SAFETY: the caller has these instructions and the elements; the store needs no alignment.
-                    unsafe { $store(to, self.0) }
-                }
-                #[inline(always)]
-                unsafe fn splat(value: f32) -> Self {
-                    // SAFETY: the caller has these instructions.
-                    $name(unsafe { $splat(value) })
-                }
-                #[inline(always)]
-                unsafe fn mul_add(self, b: Self, c: Self) -> Self {
-                    // SAFETY: the caller has these instructions.
-                    $name(unsafe { $fma(self.0, b.0, c.0) })
-                }
-                #[inline(always)]
-                unsafe fn add(self, b: Self) -> Self {
-                    // SAFETY: the caller has these instructions.
-                    $name(unsafe { $add(self.0, b.0) })
-                }
-            }
-        };
-    }
-
-    // 32 registers: 24 sums, 2 of B, 1 broadcast. 14 rows would fit, but not the pointers to them.
-    vector!(
-        Sixteen,
-        __m512,
-        16,
-        12,
-        _mm512_setzero_ps,
-        _mm512_loadu_ps,
-        _mm512_storeu_ps,
-        _mm512_set1_ps,
-        _mm512_fmadd_ps,
-        _mm512_add_ps
-    );
-    // 16 registers: 12 sums, 2 of B, 1 broadcast.
-    vector!(
-        Eight,
-        __m256,
-        8,
-        6,
-        _mm256_setzero_ps,
-        _mm256_loadu_ps,
-        _mm256_storeu_ps,
-        _mm256_set1_ps,
-        _mm256_fmadd_ps,
-        _mm256_add_ps
-    );
-}
-
 /// # Safety
 ///
 /// As [`Job::run`], on a processor with AVX-512 F.
@@ -498,6 +398,16 @@ mod x86 {
 unsafe fn run_avx512(job: &Job<'_>) {
     // SAFETY: the caller's promise.
     unsafe { job.run::<x86::Sixteen>() }
+}
+
+/// # Safety
+///
+/// As [`Job::run`], on a processor with AVX-512 F and BF16.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512bf16,avx2,fma")]
+unsafe fn run_pairs(job: &Job<'_>) {
+    // SAFETY: the caller's promise.
+    unsafe { job.run::<x86::Pairs>() }
 }
 
 /// # Safety

@@ -32,6 +32,8 @@ pub mod profile;
 
 pub mod gemm;
 mod pack;
+pub mod pairs;
+mod vector;
 
 pub mod attention;
 pub mod gelu;

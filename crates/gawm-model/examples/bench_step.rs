@@ -2,7 +2,7 @@
 //!
 //! `cargo run --release -p gawm-model --example bench_step -- MODE [PRESET] [CLIPS] [REPEATS]`, where MODE is `step`,
 //! `encode` or `plan` (where CLIPS is the number of iterations); `bench_peer.py` prints the same lines for PyTorch. `RAYON_NUM_THREADS` sets the threads.
-//! With `--profile` a further repeat is counted by the kernels: seconds of all threads and GFLOP/s per kind.
+//! `--bf16` rounds operands of products (step and encode). With `--profile` a further repeat is counted by the kernels: seconds of all threads and GFLOP/s per kind.
 //! A line has the smallest wall time and the smallest CPU time (user and system, all threads) of a repeat, after one repeat that is not counted.
 
 use std::time::Instant;
@@ -12,8 +12,8 @@ use gawm_kernels::profile;
 use gawm_model::objective::StateRule;
 use gawm_model::plan::{CemConfig, SeededNoise, Start, plan_to_goal};
 use gawm_model::{
-    AdamW, AdamWConfig, Clips, DataWidths, Device, Gradients, ModelConfig, Objectives, Pass, Stream, Tensor,
-    WorldModel, losses,
+    AdamW, AdamWConfig, Clips, DataWidths, Device, Gradients, ModelConfig, Objectives, Pass, Precision,
+    Stream, Tensor, WorldModel, losses,
 };
 
 const WIDTHS: DataWidths = DataWidths { action: 10, state: 6 };
@@ -21,7 +21,11 @@ const WIDTHS: DataWidths = DataWidths { action: 10, state: 6 };
 fn main() -> anyhow::Result<()> {
     let mut arguments: Vec<String> = std::env::args().skip(1).collect();
     let profiled = arguments.iter().any(|argument| argument == "--profile");
-    arguments.retain(|argument| argument != "--profile");
+    let precision = match arguments.iter().any(|argument| argument == "--bf16") {
+        true => Precision::Bf16,
+        false => Precision::F32,
+    };
+    arguments.retain(|argument| argument != "--profile" && argument != "--bf16");
     let argument = |index: usize| arguments.get(index).map(String::as_str);
     let mode = argument(0).context("expected step, encode or plan")?;
     let preset = argument(1).unwrap_or("tiny-14");
@@ -41,7 +45,7 @@ fn main() -> anyhow::Result<()> {
             let clips = Clips::try_new(frames, actions, states, None, &StateRule::default())?;
             let mut optimizer = AdamW::new(AdamWConfig::default());
             measure(repeats, profiled, || {
-                let pass = Pass::train(9, optimizer.step_count());
+                let pass = Pass { precision, ..Pass::train(9, optimizer.step_count()) };
                 let losses = losses(&model, &clips, &Objectives::default(), &pass)?;
                 let gradients = Gradients::of(&losses.total, model.parameters())?;
                 optimizer.step(model.parameters(), &gradients, 5e-5)?;
@@ -49,7 +53,7 @@ fn main() -> anyhow::Result<()> {
             })?
         }
         "encode" => measure(repeats, profiled, || {
-            model.encode(&frames, &Pass::eval())?.detach();
+            model.encode(&frames, &Pass { precision, ..Pass::eval() })?.detach();
             Ok(())
         })?,
         "plan" => measure(repeats, profiled, || plan(&model, size, clips))?,

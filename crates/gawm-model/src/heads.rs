@@ -7,7 +7,7 @@ use crate::Result;
 use crate::config::{Architecture, InverseInput};
 use crate::layers::{LayerNorm, Linear, gelu};
 use crate::parameters::{Parameters, Specs};
-use crate::pass::{Pass, Precision};
+use crate::pass::Pass;
 use crate::projector::fused_head;
 
 /// `Linear -> LayerNorm -> GELU -> Linear`.
@@ -40,7 +40,7 @@ impl Head {
 
     /// Maps [.., inputs] to [.., outputs].
     fn forward(&self, x: &Tensor, pass: &Pass) -> Result<Tensor> {
-        if pass.training && pass.precision == Precision::F32 && self.fused.takes(x) {
+        if pass.trains_fused(x) && self.fused.takes(x) {
             let mut dims = x.dims().to_vec();
             let (y, _) = self.fused.forward(&x.flatten_to(D::Minus2)?)?;
             if let Some(last) = dims.last_mut() {

@@ -25,6 +25,9 @@ pub enum Precision {
     #[default]
     F32,
     /// Operands rounded to bf16, results widened to f32; parameters, statistics, norms, softmax and losses stay f32.
+    ///
+    /// In training on a CPU only the encoder's linear layers are worth rounding: its attention, the predictor and the heads
+    /// keep f32 operands there.
     Bf16,
 }
 
@@ -63,6 +66,12 @@ impl Pass {
             return Ok(x.clone());
         }
         x * Tensor::from_vec(self.dropout_mask(x.elem_count(), rate, site), x.shape(), x.device())?
+    }
+
+    /// Whether fused operations in f32 may compute a training pass over `x`: they are for CPUs, where they are faster than
+    /// composed ones in any precision.
+    pub(crate) fn trains_fused(&self, x: &Tensor) -> bool {
+        self.training && x.device().is_cpu()
     }
 
     /// Whether [`Pass::dropout`] does anything.

@@ -9,7 +9,7 @@ use crate::layers::{
     LayerNorm, Linear, attention, causal_mask, gelu, join_heads, normalize, silu, split_heads,
 };
 use crate::parameters::{Init, Parameters, Specs, weight};
-use crate::pass::{Pass, Precision};
+use crate::pass::Pass;
 
 /// Causal transformer over latents, conditioned on action embeddings.
 ///
@@ -139,7 +139,7 @@ impl Predictor {
     pub fn forward(&self, z: &Tensor, c: &Tensor, pass: &Pass) -> Result<Tensor> {
         let (_, t, _) = z.dims3()?;
         let fits = t <= self.pos_embedding.dim(1)? && !self.blocks.is_empty() && c.dims() == z.dims();
-        if pass.training && pass.precision == Precision::F32 && fits && self.fused.takes(z, c) {
+        if pass.trains_fused(z) && fits && self.fused.takes(z, c) {
             return self.forward_fused(z, c, pass);
         }
         self.forward_composed(z, c, pass)

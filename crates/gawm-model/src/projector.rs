@@ -6,7 +6,7 @@ use gawm_kernels::head::{Head, HeadNorm};
 use crate::Result;
 use crate::layers::{BatchNorm, Linear, gelu};
 use crate::parameters::{Parameters, Specs};
-use crate::pass::{Pass, Precision};
+use crate::pass::Pass;
 
 /// `Linear -> BatchNorm -> GELU -> Linear`.
 #[derive(Debug, Clone)]
@@ -39,7 +39,7 @@ impl Projector {
     /// Maps rows [N, inputs] to [N, outputs]. In training the batch statistics run over all N rows.
     pub fn forward(&self, x: &Tensor, pass: &Pass) -> Result<Tensor> {
         let rows = x.dim(0)?;
-        if pass.training && pass.precision == Precision::F32 && rows > 1 && self.fused.takes(x) {
+        if pass.trains_fused(x) && rows > 1 && self.fused.takes(x) {
             let (y, statistics) = self.fused.forward(x)?;
             if let Some([mean, variance]) = statistics {
                 self.norm.track(&mean, &variance, rows)?;

@@ -2,11 +2,12 @@
 
 use super::VitShape;
 use super::layer::{LayerPass, LayerState};
+use super::products::{Matrix, Operands};
 use super::weights::{
     CLASS_TOKEN, LAST_NORM, LAYER_PARAMETERS, Layout, OUTER_PARAMETERS, PATCH_BIAS, PATCH_WEIGHT, Packs,
 };
 use crate::attention::AttentionScratch;
-use crate::gemm::{ACCUMULATE, Epilogue, Lhs, Rhs, gemm};
+use crate::gemm::Epilogue;
 use crate::norm;
 use crate::profile::{Kind, span};
 
@@ -87,6 +88,7 @@ pub(super) struct Scratch {
     pub(super) k: Vec<f32>,
     pub(super) v: Vec<f32>,
     pub(super) attention: AttentionScratch,
+    pub(super) operands: Operands,
 }
 
 /// Returns the first `count` elements, growing the vector where it is shorter; what it held stays or is zero.
@@ -176,9 +178,17 @@ impl Pass<'_> {
             let (class, projected) = tokens.split_at_mut(w);
             class.copy_from_slice(self.parameters[CLASS_TOKEN]);
             let epilogue = Epilogue { accumulate: false, bias: Some(self.parameters[PATCH_BIAS]) };
-            let a = Lhs { values: patches, row_stride: values, k_stride: 1 };
+            let x = Matrix { values: patches, stride: values };
             span(Kind::LinearForward, 2 * n_patches * w * values, || {
-                gemm([n_patches, w, values], a, Rhs::Packed(self.packs.patch()), projected, w, epilogue);
+                let sizes = [n_patches, w, values];
+                scratch.operands.by_weight(
+                    shape.products,
+                    sizes,
+                    x,
+                    self.packs.patch(),
+                    (projected, w),
+                    epilogue,
+                );
             });
             norm::add(self.positions, tokens);
         }
@@ -198,11 +208,11 @@ impl Pass<'_> {
                 norm::add(tokens, layout.one(sums, layout.positions()));
                 norm::add_columns(projected, layout.one(sums, PATCH_BIAS));
             });
-            let a = Lhs { values: projected, row_stride: 1, k_stride: w };
-            let b = Rhs::Rows { values: patches, stride: values };
+            let (dy, x) =
+                (Matrix { values: projected, stride: w }, Matrix { values: patches, stride: values });
             span(Kind::LinearWeightGradient, 2 * n_patches * w * values, || {
                 let d_weight = layout.one(sums, PATCH_WEIGHT);
-                gemm([w, values, n_patches], a, b, d_weight, values, ACCUMULATE);
+                scratch.operands.of_weight(shape.products, [n_patches, w, values], dy, x, d_weight);
             });
         }
     }

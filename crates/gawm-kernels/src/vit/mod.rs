@@ -9,6 +9,7 @@
 
 mod chunk;
 mod layer;
+mod products;
 mod weights;
 
 use std::sync::Mutex;
@@ -45,6 +46,18 @@ pub struct VitShape {
     pub mlp_width: usize,
     /// Added to the variance in the norms.
     pub epsilon: f32,
+    /// How products of linear layers are computed.
+    pub products: Products,
+}
+
+/// How the products of linear layers are computed; attention, norms and sums are f32 always.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Products {
+    /// In f32.
+    #[default]
+    Single,
+    /// Operands rounded to bf16, sums in f32; only where [`crate::pairs::available`].
+    Pairs,
 }
 
 /// Tokens that a chunk has at least, unless there are no more.

@@ -6,6 +6,7 @@ mod composed;
 mod gemm;
 mod head;
 mod linear;
+mod pairs;
 mod pointwise;
 mod predictor;
 mod reference;
