@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 use std::io::{IsTerminal, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
@@ -15,6 +15,7 @@ use crate::config::{self, ConfigError, EvalConfig, Protocol};
 use crate::data::DataError;
 use crate::diagnose::{DiagnoseError, DiagnoseReport, diagnose};
 use crate::planner::PlannerConfigError;
+use crate::problem::ProblemError;
 use crate::program::{self, ProgramError};
 use crate::run::{Run, RunError};
 use crate::suite::SuiteError;
@@ -110,9 +111,10 @@ enum ProtocolName {
 
 #[derive(Debug, Args)]
 struct CompareArgs {
-    /// Folders that `plan` wrote; the first method is compared with the others
-    #[arg(required = true)]
-    results: Vec<PathBuf>,
+    /// Folders that `plan` wrote, as DIR or LABEL=DIR; folders of one method or label are its runs, and the first
+    /// method is compared with the others
+    #[arg(required = true, value_name = "[LABEL=]DIR")]
+    results: Vec<String>,
     /// Folder for compare.json, compare.md and index.html
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -214,6 +216,9 @@ fn hint(error: &anyhow::Error) -> Option<&'static str> {
     }
     if let Some(ProgramError::NoData) = error.downcast_ref() {
         return Some("add --data DIR, or --set plan.source=simulator");
+    }
+    if let Some(ProgramError::Problems(ProblemError::TooFew { .. })) = error.downcast_ref() {
+        return Some("--set plan.count=N asks for fewer; plan.source=simulator makes as many as are needed");
     }
     let is_missing = |error: &DataError| matches!(error, DataError::MissingFrame { .. });
     let data = error.downcast_ref::<DataError>().is_some_and(is_missing)
@@ -332,8 +337,15 @@ fn print_plan(report: &crate::suite::PlanReport, folder: &std::path::Path) -> st
 }
 
 fn run_compare(arguments: &CompareArgs) -> anyhow::Result<ExitCode> {
-    let folders =
-        arguments.results.iter().map(|path| PlanFolder::read(path)).collect::<Result<Vec<_>, _>>()?;
+    let read = |text: &String| {
+        // A folder that is there is meant, whatever its name.
+        let (label, path) = match text.split_once('=') {
+            Some((label, path)) if !Path::new(text).exists() => (Some(label.to_owned()), path),
+            _ => (None, text.as_str()),
+        };
+        PlanFolder::read(Path::new(path)).map(|folder| PlanFolder { label, ..folder })
+    };
+    let folders = arguments.results.iter().map(read).collect::<Result<Vec<_>, _>>()?;
     let table = compare(&folders);
     if let Some(out) = &arguments.out {
         program::write_comparison(out, &table)?;

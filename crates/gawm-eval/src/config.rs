@@ -2,14 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
+use gawm_schema::pipeline::{Override, OverrideError, SECTIONS, unknown_section};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::diagnose::DiagnoseOptions;
 use crate::planner::PlannerConfig;
 
-/// Names of the sections that a pipeline file may have; each program reads its own.
-const SECTIONS: [&str; 7] = ["sim", "ingest", "loader", "model", "objectives", "train", "eval"];
 /// Largest pipeline file.
 const MAX_BYTES: u64 = 1 << 20;
 
@@ -118,7 +117,7 @@ pub enum ConfigError {
     /// The file is no TOML, or a field is unknown or of the wrong type.
     #[error("{place}: {message}")]
     Syntax {
-        /// File, or override.
+        /// The file, or the section.
         place: String,
         /// What the parser said.
         message: String,
@@ -131,6 +130,9 @@ pub enum ConfigError {
         /// The section.
         name: String,
     },
+    /// An override does not fit.
+    #[error(transparent)]
+    Override(#[from] OverrideError),
     /// A number is out of range.
     #[error("{field}: expected {expected}, got {got}")]
     Range {
@@ -153,7 +155,7 @@ pub fn read(path: Option<&Path>, overrides: &[String]) -> Result<EvalConfig, Con
         None => toml::Table::new(),
     };
     for text in overrides {
-        apply(&mut table, text)?;
+        Override::of_section("eval", text)?.apply(&mut table)?;
     }
     let place = path.map_or_else(|| "[eval]".to_owned(), |path| format!("{} [eval]", path.display()));
     let config: EvalConfig = toml::Value::Table(table).try_into().map_err(|error: toml::de::Error| {
@@ -180,33 +182,14 @@ fn section(path: &Path) -> Result<toml::Table, ConfigError> {
     }
     let text = std::fs::read_to_string(path).map_err(io)?;
     let mut file: toml::Table = text.parse().map_err(|error: toml::de::Error| syntax(error.to_string()))?;
-    if let Some(name) = file.keys().find(|name| !SECTIONS.contains(&name.as_str())) {
-        return Err(ConfigError::Section { path: path.to_owned(), name: name.clone() });
+    if let Some(name) = unknown_section(&file) {
+        return Err(ConfigError::Section { path: path.to_owned(), name: name.to_owned() });
     }
     match file.remove("eval") {
         None => Ok(toml::Table::new()),
         Some(toml::Value::Table(table)) => Ok(table),
         Some(other) => Err(syntax(format!("eval: expected a table, got {}", other.type_str()))),
     }
-}
-
-/// Puts `a.b=value` into a table; a value that is no TOML is a text.
-fn apply(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
-    let refuse =
-        |message: &str| ConfigError::Syntax { place: format!("--set {text}"), message: message.to_owned() };
-    let (path, value) = text.split_once('=').ok_or_else(|| refuse("expected key=value"))?;
-    let parsed =
-        format!("value = {value}").parse::<toml::Table>().ok().and_then(|mut one| one.remove("value"));
-    let value = parsed.unwrap_or_else(|| toml::Value::String(value.to_owned()));
-    let mut keys: Vec<&str> = path.split('.').collect();
-    let last = keys.pop().filter(|key| !key.is_empty()).ok_or_else(|| refuse("expected key=value"))?;
-    let mut inner = table;
-    for key in keys {
-        let entry = inner.entry(key.to_owned()).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-        inner = entry.as_table_mut().ok_or_else(|| refuse(&format!("{key} is no table")))?;
-    }
-    inner.insert(last.to_owned(), value);
-    Ok(())
 }
 
 #[cfg(test)]

@@ -2,10 +2,8 @@
 
 use std::path::PathBuf;
 
+use gawm_schema::pipeline::{Override, OverrideError, SECTIONS, unknown_section};
 use serde::{Deserialize, Serialize};
-
-/// Sections that a pipeline may have; each program reads its own.
-const SECTIONS: [&str; 7] = ["sim", "ingest", "loader", "model", "objectives", "train", "eval"];
 
 /// How clips are made of datasets.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -128,12 +126,9 @@ pub enum ConfigError {
         /// The name.
         name: String,
     },
-    /// A `--set` is not of the form `loader.field=value`.
-    #[error("unusable --set: expected loader.field=value, got {got:?}")]
-    Set {
-        /// What was given.
-        got: String,
-    },
+    /// A `--set` does not fit.
+    #[error(transparent)]
+    Override(#[from] OverrideError),
     /// A number is out of range.
     #[error("unusable [loader] {field}: expected {expected}, got {got}")]
     Range {
@@ -156,13 +151,11 @@ impl LoaderConfig {
     pub fn from_pipeline(text: &str, settings: &[String]) -> Result<LoaderConfig, ConfigError> {
         let syntax = |error: toml::de::Error| ConfigError::Syntax { reason: error.to_string() };
         let mut pipeline: toml::Table = toml::from_str(text).map_err(syntax)?;
-        for name in pipeline.keys() {
-            if !SECTIONS.contains(&name.as_str()) {
-                return Err(ConfigError::Section { name: name.clone() });
-            }
+        if let Some(name) = unknown_section(&pipeline) {
+            return Err(ConfigError::Section { name: name.to_owned() });
         }
         for setting in settings {
-            apply(&mut pipeline, setting)?;
+            Override::of_pipeline(setting)?.apply(&mut pipeline)?;
         }
         let section = pipeline.remove("loader").unwrap_or_else(|| toml::Value::Table(toml::Table::new()));
         let config: LoaderConfig = section.try_into().map_err(syntax)?;
@@ -241,27 +234,4 @@ impl LoaderConfig {
         }
         toml::to_string(&Pipeline { loader: self }).expect("numbers, texts and lists of them are TOML")
     }
-}
-
-/// Applies `a.b.c=value`; the value is TOML, or else a text.
-fn apply(pipeline: &mut toml::Table, setting: &str) -> Result<(), ConfigError> {
-    let wrong = || ConfigError::Set { got: setting.to_owned() };
-    let (path, value) = setting.split_once('=').ok_or_else(wrong)?;
-    let mut keys: Vec<&str> = path.trim().split('.').collect();
-    let last = keys.pop().filter(|key| !key.is_empty()).ok_or_else(wrong)?;
-    if keys.first().is_none_or(|section| !SECTIONS.contains(section)) {
-        return Err(wrong());
-    }
-    let mut table = pipeline;
-    for key in keys {
-        let entry = table.entry(key).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-        table = entry.as_table_mut().ok_or_else(wrong)?;
-    }
-    let parsed = toml::from_str::<toml::Table>(&format!("value = {value}"));
-    let value = match parsed.map(|mut table| table.remove("value")) {
-        Ok(Some(value)) => value,
-        _ => toml::Value::String(value.trim().to_owned()),
-    };
-    table.insert(last.to_owned(), value);
-    Ok(())
 }

@@ -1,6 +1,5 @@
 //! What a pipeline file says to the trainer: `[model]`, `[objectives]`, `[train]`, and how many loaders `[loader]` asks for.
 
-mod overrides;
 mod resolved;
 #[cfg(test)]
 mod tests;
@@ -9,13 +8,9 @@ use std::path::{Path, PathBuf};
 
 use gawm_model::objective::ObjectiveError;
 use gawm_model::{AdamWConfig, Decay, Device, ModelConfig, Objectives, Precision, WarmupCosine};
+use gawm_schema::pipeline::{Override, OverrideError};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
-
-pub use overrides::Override;
-
-/// Names of the sections that a pipeline file may have; each program reads its own.
-pub const SECTIONS: [&str; 7] = ["sim", "ingest", "loader", "model", "objectives", "train", "eval"];
 
 /// Everything that a run is told, resolved and checked.
 #[derive(Debug, Clone)]
@@ -126,14 +121,9 @@ pub enum ConfigError {
         /// Every refused value.
         values: Vec<RefusedValue>,
     },
-    /// An override is no `key=value`.
-    #[error("--set {text:?}: {message}")]
-    Override {
-        /// As given.
-        text: String,
-        /// What is wrong.
-        message: String,
-    },
+    /// An override does not fit.
+    #[error(transparent)]
+    Override(#[from] OverrideError),
     /// The device does not exist or the program was not built for it.
     #[error("train.device: expected a device of this machine, got {got:?} ({cause})")]
     Device {

@@ -160,7 +160,7 @@ fn run_pipeline(arguments: &RunArgs) -> ExitCode {
 fn try_run_pipeline(arguments: &RunArgs) -> Result<ExitCode, RunError> {
     let pipeline = Pipeline::load(&arguments.pipeline, &arguments.set)?;
     if arguments.print_config {
-        print(&pipeline.text_of(&crate::pipeline::SECTIONS));
+        print(&pipeline.text_of(&gawm_schema::pipeline::SECTIONS));
         return Ok(ExitCode::SUCCESS);
     }
     let program = prepare()?;
@@ -193,7 +193,7 @@ fn try_run_quickstart(arguments: &QuickstartArgs) -> Result<ExitCode, Quickstart
         let path = Path::new("quickstart");
         let pipeline =
             Pipeline::parse(path, quickstart::PIPELINE, &arguments.set).map_err(RunError::Pipeline)?;
-        print(&pipeline.text_of(&crate::pipeline::SECTIONS));
+        print(&pipeline.text_of(&gawm_schema::pipeline::SECTIONS));
         return Ok(ExitCode::SUCCESS);
     }
     let program = prepare()?;

@@ -6,14 +6,12 @@ mod steps;
 
 use std::path::{Path, PathBuf};
 
+use gawm_schema::pipeline::{Override, OverrideError, SECTIONS, unknown_section};
 pub use ledger::{Ledger, LedgerEntry, LedgerError};
 pub(crate) use run::pass_interrupts_on;
 pub use run::{Outcome, RunError, RunOptions, StepReport, run};
 pub(crate) use steps::Layout;
 pub use steps::{Step, StepName, plan_steps};
-
-/// Sections a pipeline may have, in the order of the steps that read them.
-pub const SECTIONS: [&str; 7] = ["sim", "ingest", "loader", "model", "objectives", "train", "eval"];
 
 /// A pipeline file, read and checked as far as the front door reads it.
 ///
@@ -54,14 +52,9 @@ pub enum PipelineError {
         /// The name.
         name: String,
     },
-    /// An override is not `section.key=value`.
-    #[error("override `{text}`: {detail}")]
-    Override {
-        /// As given.
-        text: String,
-        /// What is wrong.
-        detail: String,
-    },
+    /// An override does not fit.
+    #[error(transparent)]
+    Override(#[from] OverrideError),
     /// There is neither `[sim]` nor a log.
     #[error("{path}: no logs: the pipeline has no [sim] section and no log was given")]
     NoLogs {
@@ -99,12 +92,10 @@ impl Pipeline {
         let syntax = |detail: String| PipelineError::Syntax { path: path.to_owned(), detail };
         let mut document: toml::Table = toml::from_str(text).map_err(|error| syntax(error.to_string()))?;
         for text in overrides {
-            apply_override(&mut document, text)?;
+            Override::of_pipeline(text)?.apply(&mut document)?;
         }
-        for name in document.keys() {
-            if !SECTIONS.contains(&name.as_str()) {
-                return Err(PipelineError::UnknownSection { path: path.to_owned(), name: name.clone() });
-            }
+        if let Some(name) = unknown_section(&document) {
+            return Err(PipelineError::UnknownSection { path: path.to_owned(), name: name.to_owned() });
         }
         Ok(Pipeline { path: path.to_owned(), document })
     }
@@ -124,26 +115,6 @@ impl Pipeline {
             .collect();
         toml::to_string(&part).expect("a table that was parsed from TOML can be written as TOML")
     }
-}
-
-/// Sets `a.b.c=value` in a document; the value is TOML where it parses as such, else text.
-fn apply_override(document: &mut toml::Table, text: &str) -> Result<(), PipelineError> {
-    let refuse = |detail: &str| PipelineError::Override { text: text.to_owned(), detail: detail.to_owned() };
-    let (key, value) = text.split_once('=').ok_or_else(|| refuse("expected section.key=value"))?;
-    let mut keys: Vec<&str> = key.trim().split('.').collect();
-    let last = keys.pop().filter(|last| !last.is_empty() && !keys.is_empty());
-    let last = last.ok_or_else(|| refuse("expected section.key=value"))?;
-    let value = toml::from_str::<toml::Table>(&format!("v = {value}"))
-        .ok()
-        .and_then(|mut table| table.remove("v"))
-        .unwrap_or_else(|| toml::Value::String(value.to_owned()));
-    let mut table = document;
-    for key in keys {
-        let entry = table.entry(key).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-        table = entry.as_table_mut().ok_or_else(|| refuse("a name on its way is a value, not a section"))?;
-    }
-    table.insert(last.to_owned(), value);
-    Ok(())
 }
 
 #[cfg(test)]

@@ -241,6 +241,12 @@ impl Objectives {
         Ok(table)
     }
 
+    /// Returns the name of the preset that this table is, whatever is monitored beside it.
+    pub fn preset_name(&self) -> Option<&'static str> {
+        let bare = Objectives { monitored: Vec::new(), ..self.clone() };
+        PRESETS.into_iter().find(|name| Objectives::preset(name).is_ok_and(|preset| preset == bare))
+    }
+
     /// Reads a table such as `preset = "lewm"`, `weights = { sigreg = 0.02 }`, `monitored = ["straightening"]`.
     ///
     /// # Errors

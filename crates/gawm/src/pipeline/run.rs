@@ -10,7 +10,9 @@ use std::time::{Duration, Instant};
 
 use super::ledger::{Ledger, LedgerEntry, LedgerError};
 use super::steps::{Layout, Step, StepName, plan_steps};
-use super::{Pipeline, PipelineError, SECTIONS};
+use gawm_schema::pipeline::SECTIONS;
+
+use super::{Pipeline, PipelineError};
 
 /// Exit code of a program that was interrupted.
 const INTERRUPTED: u8 = 130;

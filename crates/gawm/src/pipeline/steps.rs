@@ -3,7 +3,9 @@
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-use super::{Pipeline, PipelineError, SECTIONS};
+use gawm_schema::pipeline::SECTIONS;
+
+use super::{Pipeline, PipelineError};
 
 /// A step of a pipeline, in the order they run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum)]
