@@ -1,7 +1,7 @@
 //! The roll-out of a group of sequences on one thread.
 
 use super::RolloutShape;
-use super::weights::{Block, Linear, Mlp, Norm, Packs};
+use super::weights::{Block, Heads, Linear, Mlp, Norm, Packs};
 use crate::gelu::gelu_in_place;
 use crate::gemm::{Epilogue, Lhs, Rhs, gemm};
 use crate::norm;
@@ -17,9 +17,9 @@ pub(super) struct Scratch {
     embedded: Vec<f32>,
     /// Of each block, [n, chunks, 6 latent]: shift, scale, gate of attention, then of the MLP.
     modulations: Vec<Vec<f32>>,
-    /// Of each block, [n, history, inner].
-    keys: Vec<Vec<f32>>,
-    values: Vec<Vec<f32>>,
+    /// Of each block and group of heads, [n, history, columns of the group].
+    keys: Vec<Vec<Vec<f32>>>,
+    values: Vec<Vec<Vec<f32>>>,
     x: Vec<f32>,
     y: Vec<f32>,
     z: Vec<f32>,
@@ -27,6 +27,7 @@ pub(super) struct Scratch {
     hidden: Vec<f32>,
     q: Vec<f32>,
     fresh: Vec<f32>,
+    added: Vec<f32>,
 }
 
 /// Returns the first `count` elements, growing the vector where it is shorter.
@@ -93,15 +94,18 @@ impl Pass<'_> {
         linear(c, hidden, [rows, c.inputs], embedded, false);
         silu(embedded);
         let n_blocks = self.packs.blocks.len();
-        for vectors in [&mut scratch.modulations, &mut scratch.keys, &mut scratch.values] {
-            vectors.resize_with(n_blocks, Vec::new);
+        scratch.modulations.resize_with(n_blocks, Vec::new);
+        for caches in [&mut scratch.keys, &mut scratch.values] {
+            caches.resize_with(n_blocks, Vec::new);
         }
-        let inner = self.shape.heads * self.shape.head_width;
         for (index, block) in self.packs.blocks.iter().enumerate() {
             let modulation = sized(&mut scratch.modulations[index], rows * block.modulation.outputs);
             linear(&block.modulation, embedded, [rows, block.modulation.inputs], modulation, false);
-            for cache in [&mut scratch.keys[index], &mut scratch.values[index]] {
-                sized(cache, self.n * self.shape.history * inner);
+            for caches in [&mut scratch.keys[index], &mut scratch.values[index]] {
+                caches.resize_with(block.heads.len(), Vec::new);
+                for (cache, heads) in caches.iter_mut().zip(&block.heads) {
+                    sized(cache, self.n * self.shape.history * heads.k.outputs);
+                }
             }
         }
     }
@@ -125,11 +129,42 @@ impl Pass<'_> {
 
     /// One block; of its output only the last `kept` tokens of each sequence, which is all of them or one.
     fn block(&self, index: usize, block: &Block, tokens: Tokens, kept: usize, scratch: &mut Scratch) {
-        let RolloutShape { latent: d, heads, head_width, history, .. } = *self.shape;
-        let (n, inner, count) = (self.n, heads * head_width, tokens.count);
+        let (d, n, count) = (self.shape.latent, self.n, tokens.count);
         let y = sized(&mut scratch.y, n * count * d);
         self.modulated_norm(&scratch.x, &scratch.modulations[index], (tokens, count), 0, &block.attn_norm, y);
-        for (layer, cache) in [(&block.k, &mut scratch.keys[index]), (&block.v, &mut scratch.values[index])] {
+        sized(&mut scratch.added, n * kept * d);
+        for (group, heads) in block.heads.iter().enumerate() {
+            self.attend([index, group], heads, tokens, kept, scratch);
+        }
+        if kept < count {
+            for sequence in 0..n {
+                let from = (sequence * count + count - 1) * d;
+                scratch.x.copy_within(from..from + d, sequence * d);
+            }
+        }
+        let x = &mut scratch.x[..n * kept * d];
+        let y = &mut scratch.y[..n * kept * d];
+        self.add_gated(&scratch.added[..n * kept * d], &scratch.modulations[index], (tokens, kept), 2, x);
+        self.modulated_norm(x, &scratch.modulations[index], (tokens, kept), 3, &block.mlp_norm, y);
+        mlp(&block.mlp, y, n * kept, &mut scratch.hidden, &mut scratch.z);
+        let y = &scratch.z[..n * kept * d];
+        self.add_gated(y, &scratch.modulations[index], (tokens, kept), 5, x);
+    }
+
+    /// Adds what a group of heads reads for the last `kept` tokens of each sequence; the first group overwrites.
+    fn attend(
+        &self,
+        [block, group]: [usize; 2],
+        heads: &Heads,
+        tokens: Tokens,
+        kept: usize,
+        scratch: &mut Scratch,
+    ) {
+        let RolloutShape { latent: d, head_width, history, .. } = *self.shape;
+        let (n, count, inner) = (self.n, tokens.count, heads.q.outputs);
+        let y = &scratch.y[..n * count * d];
+        let (keys, values) = (&mut scratch.keys[block][group], &mut scratch.values[block][group]);
+        for (layer, cache) in [(&heads.k, &mut *keys), (&heads.v, &mut *values)] {
             // Rows of equal distance go straight to their places.
             if count == 1 || count == history {
                 let stride = if count == 1 { history * inner } else { inner };
@@ -144,32 +179,20 @@ impl Pass<'_> {
             }
         }
         let q = sized(&mut scratch.q, n * kept * inner);
-        linear(&block.q, &y[(count - kept) * d..], [n * kept, d * (count / kept)], q, false);
+        linear(&heads.q, &y[(count - kept) * d..], [n * kept, d * (count / kept)], q, false);
         let attended = sized(&mut scratch.z, n * kept * inner);
-        let scores = sized(&mut scratch.rstd, history);
+        let scores = sized(&mut scratch.rstd, (history + 1) * inner / head_width);
         span(Kind::AttentionForward, 0, || {
             for row in 0..n * kept {
                 let (sequence, seen) = (row / kept, tokens.first + count - kept + row % kept + 1);
                 let cache = sequence * history * inner..(sequence * history + seen) * inner;
-                let (keys, values) = (&scratch.keys[index][cache.clone()], &scratch.values[index][cache]);
                 let output = &mut attended[row * inner..][..inner];
-                attend(&q[row * inner..][..inner], keys, values, head_width, scores, output);
+                let q = &q[row * inner..][..inner];
+                attend(q, &keys[cache.clone()], &values[cache], head_width, scores, output);
             }
         });
-        if kept < count {
-            for sequence in 0..n {
-                let from = (sequence * count + count - 1) * d;
-                scratch.x.copy_within(from..from + d, sequence * d);
-            }
-        }
-        let x = &mut scratch.x[..n * kept * d];
-        let y = &mut scratch.y[..n * kept * d];
-        linear(&block.output, attended, [n * kept, inner], y, false);
-        self.add_gated(y, &scratch.modulations[index], (tokens, kept), 2, x);
-        self.modulated_norm(x, &scratch.modulations[index], (tokens, kept), 3, &block.mlp_norm, y);
-        mlp(&block.mlp, y, n * kept, &mut scratch.hidden, &mut scratch.z);
-        let y = &scratch.z[..n * kept * d];
-        self.add_gated(y, &scratch.modulations[index], (tokens, kept), 5, x);
+        let added = &mut scratch.added[..n * kept * d];
+        linear(&heads.output, attended, [n * kept, inner], added, group > 0);
     }
 
     /// Maps the last token of each sequence to the next latent.
@@ -301,29 +324,42 @@ vectorized! {
         }
     }
 
-    /// Attention of one query over the keys and values seen, [seen, heads x width], head by head.
+    /// Attention of one query over the keys and values seen, [seen, heads x width]. `scores` [at least seen + 1, heads] is
+    /// memory: heads lie side by side in it, so that exponentials are taken of many at once.
     fn attend(q: &[f32], keys: &[f32], values: &[f32], width: usize, scores: &mut [f32], output: &mut [f32]) {
         let inner = q.len();
-        let seen = keys.len() / inner;
-        let scores = &mut scores[..seen];
+        let (seen, heads) = (keys.len() / inner, inner / width);
         let scale = 1.0 / (width as f32).sqrt();
-        for (head, output) in output.chunks_exact_mut(width).enumerate() {
-            let at = |row: usize| row * inner + head * width;
-            let q = &q[head * width..][..width];
-            let mut largest = f32::NEG_INFINITY;
-            for (row, score) in scores.iter_mut().enumerate() {
-                *score = dot::<FMA>(q, &keys[at(row)..][..width]) * scale;
-                largest = if *score > largest { *score } else { largest };
+        let (largest, scores) = scores.split_at_mut(heads);
+        let scores = &mut scores[..seen * heads];
+        largest.fill(f32::NEG_INFINITY);
+        for (scores, keys) in scores.chunks_exact_mut(heads).zip(keys.chunks_exact(inner)) {
+            let products = q.chunks_exact(width).zip(keys.chunks_exact(width));
+            for (score, (q, key)) in scores.iter_mut().zip(products) {
+                *score = dot::<FMA>(q, key) * scale;
             }
-            let mut total = 0.0;
-            for score in scores.iter_mut() {
+            for (largest, score) in largest.iter_mut().zip(scores.iter()) {
+                *largest = if *score > *largest { *score } else { *largest };
+            }
+        }
+        for scores in scores.chunks_exact_mut(heads) {
+            for (score, largest) in scores.iter_mut().zip(largest.iter()) {
                 *score = exp::<FMA>(*score - largest);
-                total += *score;
             }
-            output.fill(0.0);
-            for (row, score) in scores.iter().enumerate() {
+        }
+        let totals = largest;
+        totals.fill(0.0);
+        for scores in scores.chunks_exact(heads) {
+            for (total, score) in totals.iter_mut().zip(scores) {
+                *total += score;
+            }
+        }
+        output.fill(0.0);
+        for (scores, values) in scores.chunks_exact(heads).zip(values.chunks_exact(inner)) {
+            let heads = output.chunks_exact_mut(width).zip(values.chunks_exact(width));
+            for ((output, values), (score, total)) in heads.zip(scores.iter().zip(totals.iter())) {
                 let weight = score / total;
-                for (output, value) in output.iter_mut().zip(&values[at(row)..][..width]) {
+                for (output, value) in output.iter_mut().zip(values) {
                     *output = mul_add::<FMA>(weight, *value, *output);
                 }
             }

@@ -77,6 +77,40 @@ impl Mlp {
     }
 }
 
+/// Some heads of an attention, whose queries, keys and values stay in the cache until their output is added.
+#[derive(Debug)]
+pub(super) struct Heads {
+    pub(super) q: Linear,
+    pub(super) k: Linear,
+    pub(super) v: Linear,
+    /// What these heads add to the output; the first ones add the bias.
+    pub(super) output: Linear,
+}
+
+impl Heads {
+    /// Splits all heads into groups of about [`HIDDEN`] columns.
+    fn all(shape: &RolloutShape, qkv: &[f32], output: &[f32], bias: &[f32]) -> Vec<Heads> {
+        let (inner, latent) = (shape.heads * shape.head_width, shape.latent);
+        assert_eq!(
+            [qkv.len(), output.len()],
+            [3 * inner * latent, bias.len() * inner],
+            "rollout: sizes of weights of attention"
+        );
+        let columns = (HIDDEN / shape.head_width).max(1) * shape.head_width;
+        let group = |first: usize| {
+            let count = columns.min(inner - first);
+            let part = |index: usize| {
+                let rows = &qkv[(index * inner + first) * latent..][..count * latent];
+                Linear::of(rows, count, None)
+            };
+            let mut down = Linear::of_columns(output, [bias.len(), inner], first, count);
+            down.bias = (first == 0).then(|| bias.to_vec());
+            Heads { q: part(0), k: part(1), v: part(2), output: down }
+        };
+        (0..inner).step_by(columns).map(group).collect()
+    }
+}
+
 /// Weight and bias of a norm.
 #[derive(Debug)]
 pub(super) struct Norm {
@@ -94,10 +128,7 @@ impl Norm {
 pub(super) struct Block {
     pub(super) modulation: Linear,
     pub(super) attn_norm: Norm,
-    pub(super) q: Linear,
-    pub(super) k: Linear,
-    pub(super) v: Linear,
-    pub(super) output: Linear,
+    pub(super) heads: Vec<Heads>,
     pub(super) mlp_norm: Norm,
     pub(super) mlp: Mlp,
 }
@@ -115,22 +146,14 @@ pub(super) struct Packs {
 
 impl Packs {
     pub(super) fn new(shape: &RolloutShape, parameters: &RolloutParameters<'_>) -> Packs {
-        let inner = shape.heads * shape.head_width;
         let [a, a_bias, b, b_bias, c, c_bias] = parameters.embedder;
         let block = |parameters: &[&[f32]; 13]| {
             let [ada, ada_bias, norm1, bias1, qkv, out, out_bias, norm2, bias2, up, up_bias, down, down_bias] =
                 *parameters;
-            let part = |index: usize| {
-                let size = inner * shape.latent;
-                Linear::of(&qkv[index * size..(index + 1) * size], inner, None)
-            };
             Block {
                 modulation: Linear::new(ada, ada_bias),
                 attn_norm: Norm::new(norm1, bias1),
-                q: part(0),
-                k: part(1),
-                v: part(2),
-                output: Linear::new(out, out_bias),
+                heads: Heads::all(shape, qkv, out, out_bias),
                 mlp_norm: Norm::new(norm2, bias2),
                 mlp: Mlp::new(up, up_bias, down, down_bias),
             }
