@@ -206,7 +206,7 @@ impl Job<'_> {
 }
 
 /// One tile of the result: up to `V::ROWS` rows and two vectors.
-struct Tile<'a> {
+pub(crate) struct Tile<'a> {
     job: &'a Job<'a>,
     row: usize,
     first: usize,
@@ -227,33 +227,33 @@ impl Tile<'_> {
         unsafe {
             if self.columns <= V::LANES {
                 match rows {
-                    1 => self.run::<V, 1, 1>(),
-                    2 => self.run::<V, 2, 1>(),
-                    3 => self.run::<V, 3, 1>(),
-                    4 => self.run::<V, 4, 1>(),
-                    5 => self.run::<V, 5, 1>(),
-                    6 => self.run::<V, 6, 1>(),
-                    7 => self.run::<V, 7, 1>(),
-                    8 => self.run::<V, 8, 1>(),
-                    9 => self.run::<V, 9, 1>(),
-                    10 => self.run::<V, 10, 1>(),
-                    11 => self.run::<V, 11, 1>(),
-                    _ => self.run::<V, 12, 1>(),
+                    1 => V::tile::<1, 1>(self),
+                    2 => V::tile::<2, 1>(self),
+                    3 => V::tile::<3, 1>(self),
+                    4 => V::tile::<4, 1>(self),
+                    5 => V::tile::<5, 1>(self),
+                    6 => V::tile::<6, 1>(self),
+                    7 => V::tile::<7, 1>(self),
+                    8 => V::tile::<8, 1>(self),
+                    9 => V::tile::<9, 1>(self),
+                    10 => V::tile::<10, 1>(self),
+                    11 => V::tile::<11, 1>(self),
+                    _ => V::tile::<12, 1>(self),
                 }
             } else {
                 match rows {
-                    1 => self.run::<V, 1, 2>(),
-                    2 => self.run::<V, 2, 2>(),
-                    3 => self.run::<V, 3, 2>(),
-                    4 => self.run::<V, 4, 2>(),
-                    5 => self.run::<V, 5, 2>(),
-                    6 => self.run::<V, 6, 2>(),
-                    7 => self.run::<V, 7, 2>(),
-                    8 => self.run::<V, 8, 2>(),
-                    9 => self.run::<V, 9, 2>(),
-                    10 => self.run::<V, 10, 2>(),
-                    11 => self.run::<V, 11, 2>(),
-                    _ => self.run::<V, 12, 2>(),
+                    1 => V::tile::<1, 2>(self),
+                    2 => V::tile::<2, 2>(self),
+                    3 => V::tile::<3, 2>(self),
+                    4 => V::tile::<4, 2>(self),
+                    5 => V::tile::<5, 2>(self),
+                    6 => V::tile::<6, 2>(self),
+                    7 => V::tile::<7, 2>(self),
+                    8 => V::tile::<8, 2>(self),
+                    9 => V::tile::<9, 2>(self),
+                    10 => V::tile::<10, 2>(self),
+                    11 => V::tile::<11, 2>(self),
+                    _ => V::tile::<12, 2>(self),
                 }
             }
         }
@@ -267,7 +267,7 @@ impl Tile<'_> {
     /// - Rows `row..row + ROWS` of A and C exist; `b` holds `k` rows of `2 * V::LANES` elements, `b_stride` apart;
     ///   columns `first..first + columns` of C and of the bias exist.
     #[inline(always)]
-    unsafe fn run<V: Vector, const ROWS: usize, const VECTORS: usize>(&self) {
+    pub(crate) unsafe fn run<V: Vector, const ROWS: usize, const VECTORS: usize>(&self) {
         let job = self.job;
         let a_k = job.a.k_stride;
         let mut a = [job.a.values.as_ptr(); ROWS];

@@ -1,11 +1,20 @@
 //! Vector registers of each level, for register tiles of products.
 
+use crate::gemm::Tile;
+
 /// A vector register.
 pub(crate) trait Vector: Copy {
     /// Elements of a register.
     const LANES: usize;
     /// Rows of a tile: as many as leave registers for B and a broadcast, and at most 12.
     const ROWS: usize;
+    /// Calls [`Tile::run`] in a function of its own: with all tiles in one, the compiler ran out of registers for what
+    /// surrounds their loops, and short sums took up to a quarter longer.
+    ///
+    /// # Safety
+    ///
+    /// As [`Tile::run`].
+    unsafe fn tile<const ROWS: usize, const VECTORS: usize>(tile: &Tile<'_>);
     /// # Safety
     ///
     /// Needs the instructions of the type.
@@ -39,6 +48,11 @@ pub(crate) struct Four([f32; 4]);
 impl Vector for Four {
     const LANES: usize = 4;
     const ROWS: usize = 4;
+    #[inline(never)]
+    unsafe fn tile<const ROWS: usize, const VECTORS: usize>(tile: &Tile<'_>) {
+        // SAFETY: the caller's promise.
+        unsafe { tile.run::<Self, ROWS, VECTORS>() }
+    }
     #[inline(always)]
     unsafe fn zero() -> Self {
         Four([0.0; 4])
@@ -72,16 +86,28 @@ pub(crate) mod x86 {
     use std::arch::x86_64::*;
 
     use super::Vector;
+    use crate::gemm::Tile;
 
     /// Implements [`Vector`] by the intrinsics of one set of instructions.
     macro_rules! vector {
-        ($name:ident, $register:ty, $lanes:literal, $rows:literal, $zero:ident, $load:ident, $store:ident, $splat:ident, $fma:ident, $add:ident) => {
+        ($name:ident, $features:literal, $register:ty, $lanes:literal, $rows:literal, $zero:ident, $load:ident, $store:ident, $splat:ident, $fma:ident, $add:ident) => {
             #[derive(Clone, Copy)]
             pub(crate) struct $name($register);
 
             impl Vector for $name {
                 const LANES: usize = $lanes;
                 const ROWS: usize = $rows;
+                #[inline(always)]
+                unsafe fn tile<const ROWS: usize, const VECTORS: usize>(tile: &Tile<'_>) {
+                    #[inline(never)]
+                    #[target_feature(enable = $features)]
+                    unsafe fn alone<const ROWS: usize, const VECTORS: usize>(tile: &Tile<'_>) {
+                        // SAFETY: the caller's promise.
+                        unsafe { tile.run::<$name, ROWS, VECTORS>() }
+                    }
+                    // SAFETY: the caller has these instructions, and promises the rest.
+                    unsafe { alone::<ROWS, VECTORS>(tile) }
+                }
                 #[inline(always)]
                 unsafe fn zero() -> Self {
                     // SAFETY: the caller has these instructions.
@@ -124,6 +150,17 @@ pub(crate) mod x86 {
         const LANES: usize = Sixteen::LANES;
         const ROWS: usize = Sixteen::ROWS;
         #[inline(always)]
+        unsafe fn tile<const ROWS: usize, const VECTORS: usize>(tile: &Tile<'_>) {
+            #[inline(never)]
+            #[target_feature(enable = "avx512f,avx512bf16,avx2,fma")]
+            unsafe fn alone<const ROWS: usize, const VECTORS: usize>(tile: &Tile<'_>) {
+                // SAFETY: the caller's promise.
+                unsafe { tile.run::<Pairs, ROWS, VECTORS>() }
+            }
+            // SAFETY: the caller has these instructions, and promises the rest.
+            unsafe { alone::<ROWS, VECTORS>(tile) }
+        }
+        #[inline(always)]
         unsafe fn zero() -> Self {
             // SAFETY: the caller has these instructions.
             Pairs(unsafe { Sixteen::zero() })
@@ -162,6 +199,7 @@ pub(crate) mod x86 {
     // 32 registers: 24 sums, 2 of B, 1 broadcast. 14 rows would fit, but not the pointers to them.
     vector!(
         Sixteen,
+        "avx512f,avx2,fma",
         __m512,
         16,
         12,
@@ -175,6 +213,7 @@ pub(crate) mod x86 {
     // 16 registers: 12 sums, 2 of B, 1 broadcast.
     vector!(
         Eight,
+        "avx2,fma",
         __m256,
         8,
         6,
