@@ -133,19 +133,22 @@ fn product(
     {
         rest.fill(&values[n - n % width..], [k, n % width], [stride, 1]);
     }
-    let job = Job { m, n, k, a, b, rest: rest.values(), c: c.as_mut_ptr(), c_stride, epilogue };
+    let job = Job { m, n, k, a, b, rest: rest.values(), c: c.as_mut_ptr(), c_stride, epilogue, terms };
     match level() {
         // SAFETY: `gemm_pairs` found the instruction; the assertions above are the preconditions of `Job::run`.
         #[cfg(target_arch = "x86_64")]
-        Level::Avx512 if terms == Terms::Pairs => unsafe { run_pairs(&job) },
+        Level::Avx512 if job.terms == Terms::Pairs => unsafe { run_pairs(&job) },
         // SAFETY: AVX-512 F is there at this level; the assertions above are the preconditions of `Job::run`.
         #[cfg(target_arch = "x86_64")]
         Level::Avx512 => unsafe { run_avx512(&job) },
         // SAFETY: AVX2 and FMA are there at this level; the assertions above are the preconditions of `Job::run`.
         #[cfg(target_arch = "x86_64")]
         Level::Avx2 => unsafe { run_avx2(&job) },
-        // SAFETY: this level needs nothing; the assertions above are the preconditions of `Job::run`.
-        _ => unsafe { job.run::<Four>() },
+        _ => {
+            debug_assert_eq!(job.terms, Terms::Single, "gemm: pairs need a level of their own");
+            // SAFETY: this level needs nothing; the assertions above are the preconditions of `Job::run`.
+            unsafe { job.run::<Four>() }
+        }
     }
 }
 
@@ -171,6 +174,7 @@ struct Job<'a> {
     c: *mut f32,
     c_stride: usize,
     epilogue: Epilogue<'a>,
+    terms: Terms,
 }
 
 /// Widest tile of any level, in elements.

@@ -14,7 +14,8 @@
 //! | bytes to standardised planes | | [`pixels::standardize`] |
 //!
 //! They are made of [`gemm`], [`attention`], [`norm`] and [`gelu`]. `gawm-model` calls them where a composed expression
-//! stood; that expression stays for other devices and precisions, and is what tests compare with.
+//! stood; that expression stays for other devices, and is what tests compare with. Operands of the transformer's linear
+//! layers may be rounded to bf16 ([`pairs`], [`vit::Products`]).
 //!
 //! # Decision: parallel over data, not over operations
 //!
