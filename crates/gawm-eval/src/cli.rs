@@ -301,7 +301,7 @@ fn run_plan(arguments: &PlanArgs) -> anyhow::Result<ExitCode> {
     let text =
         toml::to_string(&toml::Table::from_iter([("eval".to_owned(), toml::Value::try_from(&config)?)]))?;
     crate::output::write(&folder.join("config.toml"), text.as_bytes())?;
-    print_plan(&result.report, &folder)?;
+    print_plan(&result.report, &folder, arguments.common.quiet)?;
     if program::is_whole(&result.report) {
         return Ok(ExitCode::SUCCESS);
     }
@@ -309,7 +309,11 @@ fn run_plan(arguments: &PlanArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::from(EXIT_LOSS))
 }
 
-fn print_plan(report: &crate::suite::PlanReport, folder: &std::path::Path) -> std::io::Result<()> {
+fn print_plan(
+    report: &crate::suite::PlanReport,
+    folder: &std::path::Path,
+    is_quiet: bool,
+) -> std::io::Result<()> {
     let mut out = std::io::stdout().lock();
     for set in &report.sets {
         writeln!(out, "{} ({} problems, {})", set.name, set.n, set.source)?;
@@ -328,7 +332,7 @@ fn print_plan(report: &crate::suite::PlanReport, folder: &std::path::Path) -> st
         }
     }
     writeln!(out, "{}", folder.join("index.html").display())?;
-    for set in &report.sets {
+    for set in report.sets.iter().filter(|_| !is_quiet) {
         for solver in &set.solvers {
             eprintln!("{} {}: {:.1} s", set.name, solver.solver.name(), solver.seconds);
         }
@@ -346,6 +350,13 @@ fn run_compare(arguments: &CompareArgs) -> anyhow::Result<ExitCode> {
         PlanFolder::read(Path::new(path)).map(|folder| PlanFolder { label, ..folder })
     };
     let folders = arguments.results.iter().map(read).collect::<Result<Vec<_>, _>>()?;
+    let mut seen = std::collections::BTreeSet::new();
+    for folder in &folders {
+        if !seen.insert(folder.path.canonicalize().unwrap_or_else(|_| folder.path.clone())) {
+            let path = folder.path.display();
+            return Err(UsageError(format!("{path} is named twice: one run would count as two")).into());
+        }
+    }
     let table = compare(&folders);
     if let Some(out) = &arguments.out {
         program::write_comparison(out, &table)?;
@@ -377,7 +388,9 @@ fn run_diagnose(arguments: &DiagnoseArgs, only_probe: bool) -> anyhow::Result<Ex
     bar.set_message("encoding trajectories");
     let diagnosis = diagnose(&run, &data, &config.diagnose, &|n| bar.set_position(n as u64))?;
     bar.finish_and_clear();
-    eprintln!("{:.1} s beyond encoding", diagnosis.seconds);
+    if !arguments.common.quiet {
+        eprintln!("{:.1} s beyond encoding", diagnosis.seconds);
+    }
     let report = &diagnosis.report;
     if only_probe {
         let folder = arguments.out.clone().unwrap_or_else(|| arguments.run.join("probe"));
@@ -419,7 +432,8 @@ fn print_diagnosis(report: &DiagnoseReport, folder: &std::path::Path) -> std::io
     }
     for score in report.probe.scores.iter().filter(|score| score.chunks == 0) {
         let (r2, rmse, unit) = (score.r2.unwrap_or(f64::NAN), score.rmse, &score.unit);
-        writeln!(out, "probe {:10} {:6} R2 {r2:.3}, RMSE {rmse:.3} {unit}", score.dim, score.probe)?;
+        let unit = if unit == "1" { String::new() } else { format!(" {unit}") };
+        writeln!(out, "probe {:10} {:6} R2 {r2:.3}, RMSE {rmse:.3}{unit}", score.dim, score.probe)?;
     }
     if let Some(r) = &report.retrieval {
         writeln!(out, "goal retrieval         {:.3} (best {:.3}, random {:.3})", r.latent, r.best, r.random)?;

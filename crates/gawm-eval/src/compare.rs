@@ -124,9 +124,22 @@ impl PlanFolder {
                         path: file.clone(),
                         message: format!("line {}: {error}", number + 1),
                     })?;
-                if parsed.solver == Solver::Model {
-                    solved.insert(parsed.outcome.id, parsed.outcome.success_any);
+                if parsed.solver == Solver::Model
+                    && let Some(_) = solved.insert(parsed.outcome.id.clone(), parsed.outcome.success_any)
+                {
+                    let message = format!("line {}: a second outcome of {}", number + 1, parsed.outcome.id);
+                    return Err(CompareError::Syntax { path: file, message });
                 }
+            }
+            let got = (solved.len(), solved.values().filter(|is_solved| **is_solved).count());
+            let expected =
+                set.solver(Solver::Model).map_or((0, 0), |model| (model.any.n, model.any.successes));
+            if got != expected {
+                let message = format!(
+                    "expected {} outcomes of the model as in plan.json, {} of them solved, got {} and {}",
+                    expected.0, expected.1, got.0, got.1
+                );
+                return Err(CompareError::Syntax { path: file, message });
             }
             outcomes.insert(set.name.clone(), solved);
         }

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use gawm_schema::pipeline::{Override, OverrideError, SECTIONS, unknown_section};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -13,7 +14,7 @@ use crate::planner::PlannerConfig;
 const MAX_BYTES: u64 = 1 << 20;
 
 /// The section `[eval]`.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EvalConfig {
     /// Planning.
@@ -23,7 +24,7 @@ pub struct EvalConfig {
 }
 
 /// Whose problems, goals and rules.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Protocol {
     /// Ours: unseen problems, none trivial, and those that need the door.
@@ -34,7 +35,7 @@ pub enum Protocol {
 }
 
 /// Where the problems of the honest protocol come from.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Source {
     /// Fresh episodes of the simulator's expert: as many as needed, none ever trained on.
@@ -45,7 +46,7 @@ pub enum Source {
 }
 
 /// Planning.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlanConfig {
     /// Whose problems, goals and rules. Default: honest.
@@ -157,10 +158,26 @@ pub fn read(path: Option<&Path>, overrides: &[String]) -> Result<EvalConfig, Con
     for text in overrides {
         Override::of_section("eval", text)?.apply(&mut table)?;
     }
-    let place = path.map_or_else(|| "[eval]".to_owned(), |path| format!("{} [eval]", path.display()));
+    from_table(&path.map_or_else(|| "[eval]".to_owned(), |path| format!("{} [eval]", path.display())), table)
+}
+
+/// Reads the section `[eval]`; `place` names it in errors.
+///
+/// # Errors
+/// - [`ConfigError`] names the place and the field.
+pub fn from_table(place: &str, table: toml::Table) -> Result<EvalConfig, ConfigError> {
+    let place = place.to_owned();
     let config: EvalConfig = toml::Value::Table(table).try_into().map_err(|error: toml::de::Error| {
         ConfigError::Syntax { place, message: error.message().to_owned() }
     })?;
+    let is_name = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    let name = &config.plan.problems;
+    if !(1..=64).contains(&name.len()) || !name.chars().all(is_name) || name.starts_with('.') {
+        let message = format!(
+            "plan.problems: expected a name of 1 to 64 letters, digits, '-', '_' and '.', got {name:?}"
+        );
+        return Err(ConfigError::Syntax { place: "[eval]".to_owned(), message });
+    }
     for (field, got, high, expected) in [
         ("plan.count", config.plan.count, 100_000, "1 to 100000"),
         ("plan.offset", config.plan.offset, 10_000, "1 to 10000"),

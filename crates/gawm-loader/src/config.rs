@@ -3,10 +3,11 @@
 use std::path::PathBuf;
 
 use gawm_schema::pipeline::{Override, OverrideError, SECTIONS, unknown_section};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// How clips are made of datasets.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LoaderConfig {
     /// `repaired` (default): clips span only the rows they use, the split is by episode, statistics are those of the
@@ -50,7 +51,7 @@ pub struct LoaderConfig {
 }
 
 /// A further dataset.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct MixEntry {
     /// Its folder.
@@ -65,7 +66,7 @@ fn one() -> f64 {
 }
 
 /// Whose semantics.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Compat {
     /// Ours.
@@ -76,7 +77,7 @@ pub enum Compat {
 }
 
 /// What is held out.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum SplitRule {
     /// Episodes that the dataset marks.

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use gawm_model::objective::ObjectiveError;
 use gawm_model::{AdamWConfig, Decay, Device, ModelConfig, Objectives, Precision, WarmupCosine};
 use gawm_schema::pipeline::{Override, OverrideError};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -28,7 +29,7 @@ pub struct Config {
 }
 
 /// The section `[train]`; the default is the published setting where there is one.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainConfig {
     /// Optimiser steps in all. Default 1000.
@@ -73,7 +74,7 @@ pub struct TrainConfig {
 }
 
 /// Precision as a user asks for it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum PrecisionChoice {
     /// What the device is good at.

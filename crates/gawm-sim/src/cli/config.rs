@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use gawm_schema::pipeline::{Override, OverrideError, SECTIONS, unknown_section};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -10,18 +11,18 @@ use crate::collect::{CollectOptions, ImageFormat};
 use crate::two_room::{ExpertConfig, FRAME_SIZE, TwoRoomConfig};
 
 /// Environments that can be collected from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
-pub(super) enum EnvironmentName {
+pub enum EnvironmentName {
     /// A dot that goes to a target, through the door of a wall
     #[default]
     TwoRoom,
 }
 
 /// How frames are stored.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
-pub(super) enum ImageName {
+pub enum ImageName {
     /// Lossless
     #[default]
     Png,
@@ -30,9 +31,9 @@ pub(super) enum ImageName {
 }
 
 /// The section `[sim]` of a pipeline, or a file of its own.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
-pub(super) struct SimConfig {
+pub struct SimConfig {
     /// Environment.
     pub(super) env: EnvironmentName,
     /// Number of episodes; needed.
@@ -84,7 +85,7 @@ impl Default for SimConfig {
 /// Why a configuration cannot be used.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub(super) enum SimConfigError {
+pub enum SimConfigError {
     /// The file cannot be read.
     #[error("cannot read {}", path.display())]
     Read {
