@@ -3,6 +3,7 @@
 mod diff;
 mod edit;
 mod filter;
+mod label;
 mod merge;
 mod preview;
 mod progress;
@@ -42,6 +43,7 @@ enum Verb {
     Stats(stats::StatsArguments),
     Report(report::ReportArguments),
     Preview(preview::PreviewArguments),
+    Label(label::LabelArguments),
     Filter(filter::FilterArguments),
     Trim(trim::TrimArguments),
     Merge(merge::MergeArguments),
@@ -71,6 +73,7 @@ pub fn run(arguments: impl IntoIterator<Item = std::ffi::OsString>) -> ExitCode 
         Verb::Stats(verb) => stats::run(verb, quiet),
         Verb::Report(verb) => report::run(verb, quiet),
         Verb::Preview(verb) => preview::run(verb, quiet),
+        Verb::Label(verb) => label::run(verb, quiet),
         Verb::Filter(verb) => filter::run(verb, quiet),
         Verb::Trim(verb) => trim::run(verb, quiet),
         Verb::Merge(verb) => merge::run(verb, quiet),

@@ -16,6 +16,7 @@ mod filter;
 mod gawm_output;
 mod history;
 mod input;
+pub mod label;
 mod lerobot_meta;
 mod lerobot_output;
 mod merge;
@@ -32,6 +33,7 @@ pub use error::EditError;
 pub use filter::{STATISTIC_NAMES, episode_values, filter};
 pub use history::{EditInput, EditRecord};
 pub use input::{Input, InputOptions};
+pub use label::LabelError;
 pub use merge::merge;
 pub use split::{SplitBy, SplitPart, parse_part, split};
 pub use trim::{TrimOptions, TrimmedEpisode, trim};
@@ -56,6 +58,8 @@ pub struct Plan {
     pub arguments: BTreeMap<String, String>,
     /// The episodes of the output.
     pub pieces: Vec<Piece>,
+    /// Other labels; the pieces are then all episodes of one input, as they are.
+    pub labels: Option<label::Relabelling>,
 }
 
 /// What an edit wrote.
@@ -87,10 +91,14 @@ pub fn write(
         return Err(EditError::NothingLeft { verb: plan.verb.clone() });
     }
     let target = output::Target::prepare(out, inputs)?;
-    let summary = if inputs.iter().all(|input| input.gawm.is_some()) {
-        gawm_output::write(inputs, plan, target.folder(), progress)?
-    } else {
-        lerobot_output::write(inputs, plan, target.folder(), progress)?
+    let summary = match inputs {
+        [Input { gawm: Some(gawm), .. }] if plan.labels.is_some() => {
+            label::write(&inputs[0], gawm, plan, target.folder(), progress)?
+        }
+        _ if inputs.iter().all(|input| input.gawm.is_some()) => {
+            gawm_output::write(inputs, plan, target.folder(), progress)?
+        }
+        _ => lerobot_output::write(inputs, plan, target.folder(), progress)?,
     };
     target.finish()?;
     Ok(summary)

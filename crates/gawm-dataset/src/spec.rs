@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use gawm_schema::batch::Split;
 use gawm_schema::{ContentHash, Schema};
 use serde::{Deserialize, Serialize};
 
@@ -92,6 +93,9 @@ pub struct EpisodeInfo {
     pub robot: String,
     /// Episodes of one session are never split between training and validation; empty: the episode is its own session.
     pub session: String,
+    /// Whether it is training or validation data; `None`: the hash of the session, or of the id, says.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub split: Option<Split>,
     /// Start of the episode in the source, in nanoseconds.
     pub start_ns: i64,
     /// End of the episode in the source, in nanoseconds.

@@ -11,6 +11,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use gawm_schema::batch::Split;
 use gawm_schema::{ContentHash, is_training};
 
 use crate::camera::CameraStats;
@@ -26,6 +27,7 @@ use crate::spec::{DatasetSpec, DatasetSummary, EpisodeInfo, RecordingInfo, Recor
 use crate::totals::Totals;
 use crate::trajectory::Trajectory;
 use episode_rows::OpenEpisode;
+pub(crate) use finish::fit;
 
 /// Writes a dataset folder.
 ///
@@ -209,7 +211,10 @@ impl DatasetWriter {
         done.record.recording = self.meta.recordings.len() as u64;
         fill_source(&mut done.record, &recording.record.source);
         let session = if done.record.session.is_empty() { &done.record.id } else { &done.record.session };
-        done.record.is_training = is_training(session, self.spec.train_share);
+        done.record.is_training = match done.split {
+            Some(split) => split == Split::Train,
+            None => is_training(session, self.spec.train_share),
+        };
         done.totals.end_episode(done.record.is_training);
         recording.totals.merge(&done.totals);
         for (name, stats) in done.cameras {

@@ -50,7 +50,7 @@ pub(super) fn episode_table(
     columns.push(("meta/episodes/chunk_index".to_owned(), ints(&|_| 0)));
     columns.push(("meta/episodes/file_index".to_owned(), ints(&|_| 0)));
     let taken: BTreeSet<String> = columns.iter().map(|(name, _)| name.clone()).collect();
-    columns.extend(extra_columns(inputs, episodes).into_iter().filter(|(name, _)| !taken.contains(name)));
+    columns.extend(extra_columns(episodes).into_iter().filter(|(name, _)| !taken.contains(name)));
     let features: BTreeSet<&String> = stats.iter().flat_map(BTreeMap::keys).collect();
     for feature in features {
         let is_camera = inputs[0].dataset.info.feature(feature).is_some_and(|f| f.is_camera());
@@ -78,18 +78,11 @@ fn text_lists<'a>(lists: impl Iterator<Item = &'a [String]>) -> ArrayRef {
 }
 
 /// Returns the columns that only others know (success, session, ...), with the type that all their values have.
-fn extra_columns(inputs: &[Input], episodes: &[OutEpisode<'_>]) -> Vec<(String, ArrayRef)> {
-    let entry = |episode: &OutEpisode<'_>| {
-        let dataset = &inputs[episode.piece.input].dataset;
-        dataset.entry(dataset.runs[episode.piece.run].episode_index)
-    };
-    let names: BTreeSet<&String> =
-        episodes.iter().filter_map(entry).flat_map(|entry| entry.extras.keys()).collect();
+fn extra_columns(episodes: &[OutEpisode<'_>]) -> Vec<(String, ArrayRef)> {
+    let names: BTreeSet<&String> = episodes.iter().flat_map(|episode| episode.extras.keys()).collect();
     let column = |name: &String| {
-        let values: Vec<&Value> = episodes
-            .iter()
-            .map(|e| entry(e).and_then(|x| x.extras.get(name)).unwrap_or(&Value::Null))
-            .collect();
+        let values: Vec<&Value> =
+            episodes.iter().map(|episode| episode.extras.get(name).unwrap_or(&Value::Null)).collect();
         (name.clone(), array_of(&values))
     };
     names.into_iter().map(column).collect()

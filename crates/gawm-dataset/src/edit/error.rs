@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 use super::condition::ConditionError;
+use super::label::LabelError;
 use crate::error::WriteError;
 use crate::read::{OpenError, ScanError};
 
@@ -34,6 +35,9 @@ pub enum EditError {
     /// The condition of `--where` cannot be understood or evaluated.
     #[error(transparent)]
     Condition(#[from] ConditionError),
+    /// The table of labels cannot be used.
+    #[error(transparent)]
+    Label(#[from] LabelError),
     /// No episode is left.
     #[error("{verb} leaves no episode, expected at least one")]
     NothingLeft {
@@ -127,6 +131,7 @@ impl EditError {
             EditError::Damaged { .. } => Some(
                 "gawm-data validate says what is wrong; --skip-damaged leaves the episodes concerned out",
             ),
+            EditError::Label(error) => Some(error.hint()),
             EditError::NothingLeft { .. } => Some("loosen the condition; --dry-run lists what it takes"),
             EditError::NotEmpty { .. } => Some("give another folder; nothing is ever overwritten"),
             EditError::InsideInput { .. } => Some("give a folder beside the dataset"),
@@ -151,6 +156,7 @@ impl EditError {
         matches!(
             self,
             EditError::Condition(_)
+                | EditError::Label(_)
                 | EditError::NotEmpty { .. }
                 | EditError::InsideInput { .. }
                 | EditError::OutputPath { .. }

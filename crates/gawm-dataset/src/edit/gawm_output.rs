@@ -7,6 +7,7 @@ use std::path::Path;
 
 use arrow::array::{Array, AsArray, BinaryArray, BooleanArray, Int64Array, RecordBatch};
 use bytes::Bytes;
+use gawm_schema::batch::Split;
 use gawm_schema::{ContentHash, Role, Schema, first_difference};
 
 use super::input::GawmInput;
@@ -245,6 +246,17 @@ fn copy_attachments(
     Ok(())
 }
 
+/// Takes columns of the episode table that gawm does not know as tags.
+pub(super) fn add_foreign_columns(input: &Input, run: usize, tags: &mut BTreeMap<String, String>) {
+    let entry = input.dataset.entry(input.dataset.runs[run].episode_index);
+    for (name, value) in entry.into_iter().flat_map(|entry| &entry.extras) {
+        if !KNOWN_COLUMNS.contains(&name.as_str()) && name != "gawm/tags" && !value.is_null() {
+            let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+            tags.entry(name.clone()).or_insert(text);
+        }
+    }
+}
+
 /// An episode on its way into the output.
 struct EpisodeCopy<'a> {
     piece: &'a Piece,
@@ -276,13 +288,7 @@ impl<'a> EpisodeCopy<'a> {
     fn info(&self, source: &Source<'_>) -> Result<EpisodeInfo, EditError> {
         let record = record_of(source, self.piece)?.clone();
         let mut tags = record.tags;
-        let entry = source.input.dataset.entry(source.input.dataset.runs[self.piece.run].episode_index);
-        for (name, value) in entry.into_iter().flat_map(|entry| &entry.extras) {
-            if !KNOWN_COLUMNS.contains(&name.as_str()) && name != "gawm/tags" && !value.is_null() {
-                let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
-                tags.entry(name.clone()).or_insert(text);
-            }
-        }
+        add_foreign_columns(source.input, self.piece.run, &mut tags);
         Ok(EpisodeInfo {
             id: record.id,
             task: record.task,
@@ -290,6 +296,8 @@ impl<'a> EpisodeCopy<'a> {
             operator: record.operator,
             robot: record.robot,
             session: record.session,
+            // A label keeps its place, and so does what a hash chose.
+            split: Some(if record.is_training { Split::Train } else { Split::Validation }),
             start_ns: record.start_ns,
             end_ns: record.end_ns,
             source_file: record.source_file,

@@ -9,7 +9,9 @@ use arrow::array::{Array, ArrayRef, Float32Array, Int64Array, RecordBatch};
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, Schema as ArrowSchema, SchemaRef};
 use parquet::arrow::ArrowWriter;
+use serde_json::Value;
 
+use super::label::{EpisodeLabels, Label, LabelValue, split_name, take_over};
 use super::piece_rows::for_each_batch;
 use super::{EditError, EditSummary, Input, Piece, Plan, history, lerobot_meta};
 use crate::block::int_array;
@@ -44,6 +46,8 @@ pub(super) struct OutEpisode<'a> {
     pub(super) from_index: u64,
     pub(super) tasks: Vec<String>,
     pub(super) videos: BTreeMap<String, VideoPlace>,
+    /// Columns of the episode table that LeRobot does not know.
+    pub(super) extras: BTreeMap<String, Value>,
 }
 
 pub(super) fn write(
@@ -53,16 +57,22 @@ pub(super) fn write(
     progress: &(dyn Fn(u64) + Sync),
 ) -> Result<EditSummary, EditError> {
     let mut notes = lerobot_meta::check_equal(inputs)?;
-    let mut videos = Videos { dir, numbers: BTreeMap::new(), copied: BTreeMap::new() };
+    let links = plan.labels.as_ref().is_some_and(|labels| !labels.copies);
+    let mut videos = Videos { dir, links, numbers: BTreeMap::new(), copied: BTreeMap::new() };
     let mut writer = RowWriter::new(inputs, dir);
     let mut episodes: Vec<OutEpisode<'_>> = Vec::new();
-    for piece in &plan.pieces {
+    for (position, piece) in plan.pieces.iter().enumerate() {
         let input = &inputs[piece.input];
+        let labels = plan.labels.as_ref().and_then(|labels| labels.episodes.get(&position));
+        let task = labels.and_then(task_of);
         let places = videos.take(input, piece)?;
         let from_index = episodes.last().map_or(0, |last| last.from_index + last.length);
-        let (file, tasks) = writer.episode(input, piece, episodes.len() as i64, from_index, progress)?;
+        let (file, tasks) =
+            writer.episode(input, piece, &task, (episodes.len() as i64, from_index), progress)?;
         let entry = input.dataset.entry(input.dataset.runs[piece.run].episode_index);
-        let said = entry.map(|entry| entry.tasks.clone()).filter(|tasks| !tasks.is_empty());
+        let said = entry.map(|entry| entry.tasks.clone()).filter(|tasks| !tasks.is_empty() && task.is_none());
+        let mut extras = entry.map(|entry| entry.extras.clone()).unwrap_or_default();
+        labels.iter().for_each(|labels| say(labels, &mut extras));
         episodes.push(OutEpisode {
             piece,
             length: piece.rows.end - piece.rows.start,
@@ -70,6 +80,7 @@ pub(super) fn write(
             from_index,
             tasks: said.unwrap_or(tasks),
             videos: places,
+            extras,
         });
     }
     writer.close()?;
@@ -79,9 +90,34 @@ pub(super) fn write(
     Ok(EditSummary { episodes: episodes.len() as u64, rows, notes })
 }
 
+/// Returns the task that a label names.
+fn task_of(labels: &EpisodeLabels) -> Option<String> {
+    match labels.get(&Label::Task)? {
+        LabelValue::Text(text) => Some(text.clone()),
+        _ => Some(String::new()),
+    }
+}
+
+/// Says labels in the columns of the episode table.
+fn say(labels: &EpisodeLabels, extras: &mut BTreeMap<String, Value>) {
+    for (label, value) in labels.iter().filter(|(label, _)| **label != Label::Task) {
+        let value = match value {
+            LabelValue::Unknown => Value::Null,
+            LabelValue::Text(text) => Value::from(text.as_str()),
+            LabelValue::Bool(value) => Value::from(*value),
+            LabelValue::Split(split) => Value::from(split_name(*split)),
+        };
+        if *label == Label::Success && extras.contains_key("success_known") {
+            extras.insert("success_known".to_owned(), Value::from(!value.is_null()));
+        }
+        extras.insert(label.column(), value);
+    }
+}
+
 /// Copies video files, each once.
 struct Videos<'a> {
     dir: &'a Path,
+    links: bool,
     /// Per camera the number of its next file.
     numbers: BTreeMap<String, u64>,
     /// Per source file its number.
@@ -145,8 +181,7 @@ impl Videos<'_> {
         if let Some(folder) = target.parent() {
             fs::create_dir_all(folder).map_err(EditError::io("create", folder))?;
         }
-        fs::copy(source, &target).map_err(EditError::io("copy to", &target))?;
-        Ok(())
+        take_over(source, &target, !self.links)
     }
 }
 
@@ -197,12 +232,13 @@ impl<'a> RowWriter<'a> {
         &mut self,
         input: &Input,
         piece: &Piece,
-        episode: i64,
-        from_index: u64,
+        task: &Option<String>,
+        (episode, from_index): (i64, u64),
         progress: &(dyn Fn(u64) + Sync),
     ) -> Result<(u64, Vec<String>), EditError> {
         let mut tasks = Vec::new();
         let mut n_rows = 0;
+        let task = task.as_ref().map(|task| self.task_number(task));
         self.open()?;
         for_each_batch(input, piece, |batch| {
             progress(batch.num_rows() as u64);
@@ -212,7 +248,10 @@ impl<'a> RowWriter<'a> {
                 expected: "columns of one type in all files".to_owned(),
                 got,
             };
-            let numbers = self.task_numbers(input, piece.input, &batch, "task_index").map_err(damaged)?;
+            let numbers = match task {
+                Some(task) => vec![task; batch.num_rows()],
+                None => self.task_numbers(input, piece.input, &batch, "task_index").map_err(damaged)?,
+            };
             for number in &numbers {
                 let text = usize::try_from(*number).ok().and_then(|n| self.tasks.get(n));
                 if let Some(text) = text.filter(|text| !tasks.contains(*text)) {
@@ -268,6 +307,15 @@ impl<'a> RowWriter<'a> {
             arrays.push(array);
         }
         RecordBatch::try_new(self.arrow.clone(), arrays).map_err(|error| error.to_string())
+    }
+
+    /// Returns the number of a task, which is new if it must be.
+    fn task_number(&mut self, task: &str) -> i64 {
+        let known = self.tasks.iter().position(|other| other == task);
+        known.unwrap_or_else(|| {
+            self.tasks.push(task.to_owned());
+            self.tasks.len() - 1
+        }) as i64
     }
 
     /// Returns whether the tasks of an input have other numbers in the output.

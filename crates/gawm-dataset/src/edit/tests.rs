@@ -8,14 +8,14 @@ use arrow::datatypes::Int64Type;
 use tempfile::TempDir;
 
 use super::*;
-use crate::read::{Dataset, ReadLimits};
+use crate::read::{Dataset, FrameBytes, ReadLimits};
 use crate::spec::WriteMode;
 use crate::stats::dataset_stats;
 use crate::validate::{Severity, ValidateOptions, validate};
 use crate::writer::tests::{tree, write_all};
 
 /// Two recordings of three episodes each.
-fn dataset() -> (TempDir, PathBuf) {
+pub(super) fn dataset() -> (TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let dir = folder.path().join("in");
     write_all(&dir, WriteMode::New, &[0, 1], 500);
@@ -23,22 +23,22 @@ fn dataset() -> (TempDir, PathBuf) {
 }
 
 /// The same rows as a LeRobot folder that knows nothing of gawm.
-fn lerobot() -> (TempDir, PathBuf) {
+pub(super) fn lerobot() -> (TempDir, PathBuf) {
     let (folder, dir) = dataset();
     fs::remove_file(dir.join("meta/gawm.json")).unwrap();
     (folder, dir)
 }
 
-fn open(dir: &Path) -> Input {
+pub(super) fn open(dir: &Path) -> Input {
     Input::open(dir, InputOptions::default()).unwrap()
 }
 
-fn run(inputs: &[Input], plan: &Plan, out: &Path) -> EditSummary {
+pub(super) fn run(inputs: &[Input], plan: &Plan, out: &Path) -> EditSummary {
     write(inputs, plan, out, &|_| {}).unwrap()
 }
 
 /// Returns the rows of an episode, all columns.
-fn rows(dir: &Path, episode: usize) -> RecordBatch {
+pub(super) fn rows(dir: &Path, episode: usize) -> RecordBatch {
     let input = open(dir);
     let mut batches = Vec::new();
     piece_rows::for_each_batch(&input, &input.pieces(0)[episode], |batch| {
@@ -49,9 +49,17 @@ fn rows(dir: &Path, episode: usize) -> RecordBatch {
     concat_batches(&batches[0].schema(), &batches).unwrap()
 }
 
+/// Returns the frames of an episode, found by the offset index of their column.
+pub(super) fn frames(dir: &Path, episode: usize) -> Vec<FrameBytes> {
+    let input = open(dir);
+    let camera = input.dataset.image_columns().remove(0);
+    let rows: Vec<usize> = (0..input.dataset.runs[episode].n_rows as usize).collect();
+    input.dataset.read_frames(episode, &camera, &rows).unwrap()
+}
+
 /// Checks that columns are those of rows of another dataset, but for those in `but` and the numbers of LeRobot.
 #[track_caller]
-fn check_rows(got: &RecordBatch, expected: &RecordBatch, but: &[&str]) {
+pub(super) fn check_rows(got: &RecordBatch, expected: &RecordBatch, but: &[&str]) {
     let numbers = ["timestamp", "frame_index", "episode_index", "index", "task_index"];
     assert_eq!(got.num_rows(), expected.num_rows());
     let names = |batch: &RecordBatch| -> Vec<String> {
@@ -65,7 +73,7 @@ fn check_rows(got: &RecordBatch, expected: &RecordBatch, but: &[&str]) {
 
 /// Checks numbers, counts and tables with the validator itself: nothing of level error, nothing about structure.
 #[track_caller]
-fn check_valid(dir: &Path, n_episodes: usize) {
+pub(super) fn check_valid(dir: &Path, n_episodes: usize) {
     let dataset = Dataset::open(dir, ReadLimits::default()).unwrap();
     assert_eq!(dataset.runs.len(), n_episodes);
     let report = validate(&dataset, &ValidateOptions::default()).unwrap();

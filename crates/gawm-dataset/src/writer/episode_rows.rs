@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
+use gawm_schema::batch::Split;
 use gawm_schema::{ContentHash, DimStats, DimSummary, Role};
 
 use crate::block::{BlockPosition, RowBlock};
@@ -48,6 +49,8 @@ pub(super) struct OpenEpisode {
 /// What an ended episode gives.
 pub(super) struct DoneEpisode {
     pub(super) record: EpisodeRecord,
+    /// What the caller says of training and validation.
+    pub(super) split: Option<Split>,
     pub(super) totals: Totals,
     pub(super) cameras: BTreeMap<String, CameraStats>,
 }
@@ -166,7 +169,7 @@ impl OpenEpisode {
             tags: info.tags,
             stats,
         };
-        Ok(DoneEpisode { record, totals: self.totals, cameras: self.cameras })
+        Ok(DoneEpisode { record, split: info.split, totals: self.totals, cameras: self.cameras })
     }
 
     /// Moves rows into the block.

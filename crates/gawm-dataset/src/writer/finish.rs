@@ -8,13 +8,40 @@ use gawm_schema::{ContentHash, FittedOn, Standardisation};
 use serde_json::{Value, json};
 
 use super::DatasetWriter;
+use crate::columns::Columns;
 use crate::durable::{remove_file, sync_folder, sync_parent, temporary};
+use crate::episode::EpisodeRecord;
 use crate::error::WriteError;
 use crate::journal::to_json;
 use crate::layout::{EPISODES, FILES_PER_CHUNK, GAWM, INFO, STATISTICS, STATS, TASKS, data_path};
 use crate::spec::DatasetSummary;
 use crate::statistics_file::{StatisticsFile, lerobot_stats};
 use crate::tables::{episodes_table, tasks_table};
+use crate::totals::Totals;
+
+/// Fits the standardisation of the continuous columns on training episodes; on all where there is none.
+pub(crate) fn fit(columns: &Columns, totals: &Totals, episodes: &[EpisodeRecord]) -> Vec<Standardisation> {
+    let has_training = totals.training_rows > 0;
+    let moments = if has_training { &totals.training } else { &totals.all };
+    let used: Vec<_> = episodes.iter().filter(|e| !has_training || e.is_training).collect();
+    let mut hasher = blake3::Hasher::new();
+    used.iter().for_each(|episode| {
+        hasher.update(&episode.content_hash.0);
+    });
+    let hash = ContentHash(*hasher.finalize().as_bytes());
+    let plans = columns.encoded.iter().zip(moments);
+    plans
+        .map(|(plan, moments)| {
+            let fitted_on = FittedOn {
+                episodes_of: if has_training { "train" } else { "all" }.to_owned(),
+                episodes: used.len() as u64,
+                frames: moments.iter().map(|m| m.count()).max().unwrap_or(0),
+                hash,
+            };
+            Standardisation::fit(plan.name, plan.encoder.dims(), moments, fitted_on)
+        })
+        .collect()
+}
 
 impl DatasetWriter {
     /// Writes the meta files under temporary names, takes info.json away, renames everything, writes info.json.
@@ -22,7 +49,7 @@ impl DatasetWriter {
     /// Until info.json is away a dataset that is being extended is as it was; from then on until the new one is there
     /// the journal makes a resumed run do all of this again.
     pub(super) fn commit(mut self) -> Result<DatasetSummary, WriteError> {
-        let standardisation = self.fit();
+        let standardisation = fit(&self.columns, &self.totals, &self.episodes);
         for (column, plan) in self.columns.encoded.iter().map(|plan| (plan.name, plan)) {
             self.meta.encodings.insert(column.to_owned(), plan.encoder.dims().to_vec());
         }
@@ -43,29 +70,6 @@ impl DatasetWriter {
         let summary = self.summary();
         self.journal.remove()?;
         Ok(summary)
-    }
-
-    fn fit(&self) -> Vec<Standardisation> {
-        let has_training = self.totals.training_rows > 0;
-        let moments = if has_training { &self.totals.training } else { &self.totals.all };
-        let used: Vec<_> = self.episodes.iter().filter(|e| !has_training || e.is_training).collect();
-        let mut hasher = blake3::Hasher::new();
-        used.iter().for_each(|episode| {
-            hasher.update(&episode.content_hash.0);
-        });
-        let hash = ContentHash(*hasher.finalize().as_bytes());
-        let plans = self.columns.encoded.iter().zip(moments);
-        plans
-            .map(|(plan, moments)| {
-                let fitted_on = FittedOn {
-                    episodes_of: if has_training { "train" } else { "all" }.to_owned(),
-                    episodes: used.len() as u64,
-                    frames: moments.iter().map(|m| m.count()).max().unwrap_or(0),
-                    hash,
-                };
-                Standardisation::fit(plan.name, plan.encoder.dims(), moments, fitted_on)
-            })
-            .collect()
     }
 
     /// Writes all meta files but info.json under temporary names and returns their final ones.

@@ -177,6 +177,7 @@ impl<'a> EpisodeSink<'a> {
             operator,
             robot,
             session,
+            split: None,
             start_ns: open.first_ns,
             end_ns: open.last_ns,
             source_file: String::new(),

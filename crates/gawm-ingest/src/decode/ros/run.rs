@@ -104,9 +104,13 @@ fn whole<'a, const ALIGN: bool, const BIG: bool, E: Emit<'a>>(
 pub(crate) fn check_end<const ALIGN: bool, const BIG: bool>(
     reader: &Reader<'_, ALIGN, BIG>,
 ) -> Result<(), DecodeError> {
-    let rest = reader.rest();
+    check_rest(reader.rest(), reader.offset())
+}
+
+/// Refuses what is left of a message from `offset` on, unless it is padding.
+pub(crate) fn check_rest(rest: &[u8], offset: usize) -> Result<(), DecodeError> {
     if rest.len() > MAX_PADDING && rest.iter().any(|b| *b != 0) {
-        return Err(DecodeError::TrailingBytes { offset: reader.offset(), surplus: rest.len() });
+        return Err(DecodeError::TrailingBytes { offset, surplus: rest.len() });
     }
     Ok(())
 }

@@ -176,6 +176,28 @@ fn lengths_that_claim_too_much_are_refused_before_memory_is_taken() {
 }
 
 #[test]
+fn what_follows_a_message_is_padding_or_refused() {
+    let library = SchemaLibrary::builtin();
+    let mut n_checked = 0;
+    for vector in vectors().iter().filter(|vector| vector.name.starts_with("xcdr2")) {
+        let channel = vector.channel(&vector.schema);
+        let plan = DecodePlan::compile(&channel, &vector.paths(), &library).unwrap();
+        let whole = plan.decode_values(&vector.payload, &mut RowSink::new()).unwrap();
+        let with = |rest: &[u8]| {
+            let payload = [vector.payload.as_slice(), rest].concat();
+            plan.decode_values(&payload, &mut RowSink::new())
+        };
+        // Middleware pads to four bytes, some of it with what lay in memory; recorders with zeros to any length.
+        assert_eq!(with(&[7, 7, 7]).unwrap(), whole, "{}", vector.name);
+        assert_eq!(with(&[0; 40]).unwrap(), whole, "{}", vector.name);
+        let error = with(&[7; 12]).unwrap_err();
+        assert_eq!(error.reason(), "message_longer_than_schema", "{}: {error}", vector.name);
+        n_checked += 1;
+    }
+    assert!(n_checked >= 3, "{n_checked}");
+}
+
+#[test]
 fn labels_that_do_not_fit_are_named() {
     let library = SchemaLibrary::builtin();
     let check = |message_encoding, schema_encoding, schema_data: &[u8], payload: &[u8], expected: &str| {

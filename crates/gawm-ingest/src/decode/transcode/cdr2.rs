@@ -4,6 +4,7 @@
 //! extended, before structs (appendable) and before each of their members (mutable).
 
 use super::super::error::DecodeError;
+use super::super::ros::run::check_rest;
 use super::super::schema::{Base, Extensibility, Field, Many, Prim, TypeTable};
 
 /// Bytes of the encapsulation header.
@@ -42,6 +43,8 @@ pub(super) fn to_xcdr1(
     let mut transcode = Transcode { types, encapsulation, data: payload, out };
     let mut at = HEADER;
     transcode.structure(types.root, encapsulation.top, &mut at, payload.len())?;
+    // What a newer type appends lies within the length of its struct; what lies behind is of no type.
+    check_rest(&payload[at..], at)?;
     Ok(transcode.out)
 }
 
