@@ -54,6 +54,7 @@ def motion(parts, is_angle):
     jerk = np.concatenate([np.abs(s[2:] - 2 * s[1:-1] + s[:-2]) for s in steps])
     idle = sum(int((np.abs(s) <= 0.02 * np.abs(s).mean()).sum()) for s in steps)
     last, rho, secs = 0, 1.0, None
+    parts = [np.unwrap(p) if is_angle else p for p in parts]
     for lag in LAGS:
         centred = [p - p.mean() for p in parts if len(p) > lag]
         top = sum(float((c[:-lag] * c[lag:]).sum()) for c in centred)

@@ -5,16 +5,21 @@
 //! their own. Codes are in [`RULES`], bounds in [`Thresholds`].
 
 mod catalogue;
+mod continuity;
+mod copies;
 mod demo;
 mod finding;
 mod group;
 mod image;
 mod layout;
+mod motion;
 mod probe;
 mod profile;
 mod render;
 mod robust;
+mod rotations;
 mod row_checks;
+mod saturation;
 mod semantic;
 mod signal;
 mod split;
@@ -23,6 +28,7 @@ mod thresholds;
 mod time;
 mod tracking;
 mod value;
+mod views;
 mod windows;
 
 use std::collections::BTreeMap;

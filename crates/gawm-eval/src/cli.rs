@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 use std::io::{IsTerminal, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
@@ -15,6 +15,7 @@ use crate::config::{self, ConfigError, EvalConfig, Protocol};
 use crate::data::DataError;
 use crate::diagnose::{DiagnoseError, DiagnoseReport, diagnose};
 use crate::planner::PlannerConfigError;
+use crate::problem::ProblemError;
 use crate::program::{self, ProgramError};
 use crate::run::{Run, RunError};
 use crate::suite::SuiteError;
@@ -110,9 +111,10 @@ enum ProtocolName {
 
 #[derive(Debug, Args)]
 struct CompareArgs {
-    /// Folders that `plan` wrote; the first method is compared with the others
-    #[arg(required = true)]
-    results: Vec<PathBuf>,
+    /// Folders that `plan` wrote, as DIR or LABEL=DIR; folders of one method or label are its runs, and the first
+    /// method is compared with the others
+    #[arg(required = true, value_name = "[LABEL=]DIR")]
+    results: Vec<String>,
     /// Folder for compare.json, compare.md and index.html
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -215,6 +217,9 @@ fn hint(error: &anyhow::Error) -> Option<&'static str> {
     if let Some(ProgramError::NoData) = error.downcast_ref() {
         return Some("add --data DIR, or --set plan.source=simulator");
     }
+    if let Some(ProgramError::Problems(ProblemError::TooFew { .. })) = error.downcast_ref() {
+        return Some("--set plan.count=N asks for fewer; plan.source=simulator makes as many as are needed");
+    }
     let is_missing = |error: &DataError| matches!(error, DataError::MissingFrame { .. });
     let data = error.downcast_ref::<DataError>().is_some_and(is_missing)
         || matches!(error.downcast_ref(), Some(ProgramError::Data(error)) if is_missing(error));
@@ -296,7 +301,7 @@ fn run_plan(arguments: &PlanArgs) -> anyhow::Result<ExitCode> {
     let text =
         toml::to_string(&toml::Table::from_iter([("eval".to_owned(), toml::Value::try_from(&config)?)]))?;
     crate::output::write(&folder.join("config.toml"), text.as_bytes())?;
-    print_plan(&result.report, &folder)?;
+    print_plan(&result.report, &folder, arguments.common.quiet)?;
     if program::is_whole(&result.report) {
         return Ok(ExitCode::SUCCESS);
     }
@@ -304,7 +309,11 @@ fn run_plan(arguments: &PlanArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::from(EXIT_LOSS))
 }
 
-fn print_plan(report: &crate::suite::PlanReport, folder: &std::path::Path) -> std::io::Result<()> {
+fn print_plan(
+    report: &crate::suite::PlanReport,
+    folder: &std::path::Path,
+    is_quiet: bool,
+) -> std::io::Result<()> {
     let mut out = std::io::stdout().lock();
     for set in &report.sets {
         writeln!(out, "{} ({} problems, {})", set.name, set.n, set.source)?;
@@ -323,7 +332,7 @@ fn print_plan(report: &crate::suite::PlanReport, folder: &std::path::Path) -> st
         }
     }
     writeln!(out, "{}", folder.join("index.html").display())?;
-    for set in &report.sets {
+    for set in report.sets.iter().filter(|_| !is_quiet) {
         for solver in &set.solvers {
             eprintln!("{} {}: {:.1} s", set.name, solver.solver.name(), solver.seconds);
         }
@@ -332,8 +341,22 @@ fn print_plan(report: &crate::suite::PlanReport, folder: &std::path::Path) -> st
 }
 
 fn run_compare(arguments: &CompareArgs) -> anyhow::Result<ExitCode> {
-    let folders =
-        arguments.results.iter().map(|path| PlanFolder::read(path)).collect::<Result<Vec<_>, _>>()?;
+    let read = |text: &String| {
+        // A folder that is there is meant, whatever its name.
+        let (label, path) = match text.split_once('=') {
+            Some((label, path)) if !Path::new(text).exists() => (Some(label.to_owned()), path),
+            _ => (None, text.as_str()),
+        };
+        PlanFolder::read(Path::new(path)).map(|folder| PlanFolder { label, ..folder })
+    };
+    let folders = arguments.results.iter().map(read).collect::<Result<Vec<_>, _>>()?;
+    let mut seen = std::collections::BTreeSet::new();
+    for folder in &folders {
+        if !seen.insert(folder.path.canonicalize().unwrap_or_else(|_| folder.path.clone())) {
+            let path = folder.path.display();
+            return Err(UsageError(format!("{path} is named twice: one run would count as two")).into());
+        }
+    }
     let table = compare(&folders);
     if let Some(out) = &arguments.out {
         program::write_comparison(out, &table)?;
@@ -365,7 +388,9 @@ fn run_diagnose(arguments: &DiagnoseArgs, only_probe: bool) -> anyhow::Result<Ex
     bar.set_message("encoding trajectories");
     let diagnosis = diagnose(&run, &data, &config.diagnose, &|n| bar.set_position(n as u64))?;
     bar.finish_and_clear();
-    eprintln!("{:.1} s beyond encoding", diagnosis.seconds);
+    if !arguments.common.quiet {
+        eprintln!("{:.1} s beyond encoding", diagnosis.seconds);
+    }
     let report = &diagnosis.report;
     if only_probe {
         let folder = arguments.out.clone().unwrap_or_else(|| arguments.run.join("probe"));
@@ -407,7 +432,8 @@ fn print_diagnosis(report: &DiagnoseReport, folder: &std::path::Path) -> std::io
     }
     for score in report.probe.scores.iter().filter(|score| score.chunks == 0) {
         let (r2, rmse, unit) = (score.r2.unwrap_or(f64::NAN), score.rmse, &score.unit);
-        writeln!(out, "probe {:10} {:6} R2 {r2:.3}, RMSE {rmse:.3} {unit}", score.dim, score.probe)?;
+        let unit = if unit == "1" { String::new() } else { format!(" {unit}") };
+        writeln!(out, "probe {:10} {:6} R2 {r2:.3}, RMSE {rmse:.3}{unit}", score.dim, score.probe)?;
     }
     if let Some(r) = &report.retrieval {
         writeln!(out, "goal retrieval         {:.3} (best {:.3}, random {:.3})", r.latent, r.best, r.random)?;

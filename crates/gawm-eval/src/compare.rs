@@ -1,9 +1,9 @@
 //! Runs side by side: the table of methods and tasks, with paired intervals.
 //!
 //! Reads the folders that `gawm-eval plan` wrote. Runs of one method are its seeds; a cell is the mean over seeds with the
-//! Wilson interval of all problems pooled. Methods are compared problem by problem where they had the same problems.
+//! Wilson interval of all problems pooled; a floor that several runs bring for the same problems counts once. Methods are compared problem by problem where they had the same problems.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -11,7 +11,7 @@ use thiserror::Error;
 
 use crate::evaluate::Outcome;
 use crate::statistics::{PairedDifference, paired_difference};
-use crate::suite::{PLAN_VERSION, PlanReport, Rate, Solver};
+use crate::suite::{PLAN_VERSION, PlanReport, Rate, SetResult, Solver, SolverResult};
 
 /// Largest file of results that is read.
 const MAX_BYTES: u64 = 1 << 30;
@@ -35,6 +35,8 @@ pub struct PlanFolder {
     pub report: PlanReport,
     /// Outcomes of the model per set: problem id to solved.
     pub outcomes: BTreeMap<String, BTreeMap<String, bool>>,
+    /// What its row is called instead of the method.
+    pub label: Option<String>,
 }
 
 /// Why results cannot be compared.
@@ -122,17 +124,37 @@ impl PlanFolder {
                         path: file.clone(),
                         message: format!("line {}: {error}", number + 1),
                     })?;
-                if parsed.solver == Solver::Model {
-                    solved.insert(parsed.outcome.id, parsed.outcome.success_any);
+                if parsed.solver == Solver::Model
+                    && let Some(_) = solved.insert(parsed.outcome.id.clone(), parsed.outcome.success_any)
+                {
+                    let message = format!("line {}: a second outcome of {}", number + 1, parsed.outcome.id);
+                    return Err(CompareError::Syntax { path: file, message });
                 }
+            }
+            let got = (solved.len(), solved.values().filter(|is_solved| **is_solved).count());
+            let expected =
+                set.solver(Solver::Model).map_or((0, 0), |model| (model.any.n, model.any.successes));
+            if got != expected {
+                let message = format!(
+                    "expected {} outcomes of the model as in plan.json, {} of them solved, got {} and {}",
+                    expected.0, expected.1, got.0, got.1
+                );
+                return Err(CompareError::Syntax { path: file, message });
             }
             outcomes.insert(set.name.clone(), solved);
         }
-        Ok(PlanFolder { path: path.to_owned(), report, outcomes })
+        Ok(PlanFolder { path: path.to_owned(), report, outcomes, label: None })
     }
 
     fn method(&self) -> String {
-        self.report.model.as_ref().map_or_else(|| "floors only".to_owned(), |model| model.method.clone())
+        let method = || self.report.model.as_ref().map(|model| model.method.clone());
+        self.label.clone().or_else(method).unwrap_or_else(|| "floors only".to_owned())
+    }
+
+    /// What tells a floor on these problems from the same floor on others.
+    fn problems(&self, set: &SetResult, result: &SolverResult) -> String {
+        serde_json::json!([set.spec, set.source, set.n, self.report.options, result.any, result.last])
+            .to_string()
     }
 
     fn column(&self, set: &str) -> String {
@@ -161,6 +183,7 @@ pub fn compare(folders: &[PlanFolder]) -> CompareTable {
     }
     let mut cells: BTreeMap<(String, String), (Vec<f64>, usize, usize)> = BTreeMap::new();
     let mut floors: Vec<String> = Vec::new();
+    let mut seen = BTreeSet::new();
     for folder in folders {
         for set in &folder.report.sets {
             for result in &set.solvers {
@@ -168,8 +191,14 @@ pub fn compare(folders: &[PlanFolder]) -> CompareTable {
                     Solver::Model => folder.method(),
                     other => other.name().to_owned(),
                 };
-                if result.solver != Solver::Model && !floors.contains(&row) {
-                    floors.push(row.clone());
+                if result.solver != Solver::Model {
+                    // Two models on the same problems bring the same floors: counted twice, intervals would lie.
+                    if !seen.insert((folder.column(&set.name), row.clone(), folder.problems(set, result))) {
+                        continue;
+                    }
+                    if !floors.contains(&row) {
+                        floors.push(row.clone());
+                    }
                 }
                 let cell = cells.entry((folder.column(&set.name), row)).or_default();
                 cell.0.push(result.any.rate);

@@ -2,19 +2,19 @@
 
 use std::path::{Path, PathBuf};
 
+use gawm_schema::pipeline::{Override, OverrideError, SECTIONS, unknown_section};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::diagnose::DiagnoseOptions;
 use crate::planner::PlannerConfig;
 
-/// Names of the sections that a pipeline file may have; each program reads its own.
-const SECTIONS: [&str; 7] = ["sim", "ingest", "loader", "model", "objectives", "train", "eval"];
 /// Largest pipeline file.
 const MAX_BYTES: u64 = 1 << 20;
 
 /// The section `[eval]`.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EvalConfig {
     /// Planning.
@@ -24,7 +24,7 @@ pub struct EvalConfig {
 }
 
 /// Whose problems, goals and rules.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Protocol {
     /// Ours: unseen problems, none trivial, and those that need the door.
@@ -35,7 +35,7 @@ pub enum Protocol {
 }
 
 /// Where the problems of the honest protocol come from.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Source {
     /// Fresh episodes of the simulator's expert: as many as needed, none ever trained on.
@@ -46,7 +46,7 @@ pub enum Source {
 }
 
 /// Planning.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlanConfig {
     /// Whose problems, goals and rules. Default: honest.
@@ -118,7 +118,7 @@ pub enum ConfigError {
     /// The file is no TOML, or a field is unknown or of the wrong type.
     #[error("{place}: {message}")]
     Syntax {
-        /// File, or override.
+        /// The file, or the section.
         place: String,
         /// What the parser said.
         message: String,
@@ -131,6 +131,9 @@ pub enum ConfigError {
         /// The section.
         name: String,
     },
+    /// An override does not fit.
+    #[error(transparent)]
+    Override(#[from] OverrideError),
     /// A number is out of range.
     #[error("{field}: expected {expected}, got {got}")]
     Range {
@@ -153,12 +156,28 @@ pub fn read(path: Option<&Path>, overrides: &[String]) -> Result<EvalConfig, Con
         None => toml::Table::new(),
     };
     for text in overrides {
-        apply(&mut table, text)?;
+        Override::of_section("eval", text)?.apply(&mut table)?;
     }
-    let place = path.map_or_else(|| "[eval]".to_owned(), |path| format!("{} [eval]", path.display()));
+    from_table(&path.map_or_else(|| "[eval]".to_owned(), |path| format!("{} [eval]", path.display())), table)
+}
+
+/// Reads the section `[eval]`; `place` names it in errors.
+///
+/// # Errors
+/// - [`ConfigError`] names the place and the field.
+pub fn from_table(place: &str, table: toml::Table) -> Result<EvalConfig, ConfigError> {
+    let place = place.to_owned();
     let config: EvalConfig = toml::Value::Table(table).try_into().map_err(|error: toml::de::Error| {
         ConfigError::Syntax { place, message: error.message().to_owned() }
     })?;
+    let is_name = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    let name = &config.plan.problems;
+    if !(1..=64).contains(&name.len()) || !name.chars().all(is_name) || name.starts_with('.') {
+        let message = format!(
+            "plan.problems: expected a name of 1 to 64 letters, digits, '-', '_' and '.', got {name:?}"
+        );
+        return Err(ConfigError::Syntax { place: "[eval]".to_owned(), message });
+    }
     for (field, got, high, expected) in [
         ("plan.count", config.plan.count, 100_000, "1 to 100000"),
         ("plan.offset", config.plan.offset, 10_000, "1 to 10000"),
@@ -180,33 +199,14 @@ fn section(path: &Path) -> Result<toml::Table, ConfigError> {
     }
     let text = std::fs::read_to_string(path).map_err(io)?;
     let mut file: toml::Table = text.parse().map_err(|error: toml::de::Error| syntax(error.to_string()))?;
-    if let Some(name) = file.keys().find(|name| !SECTIONS.contains(&name.as_str())) {
-        return Err(ConfigError::Section { path: path.to_owned(), name: name.clone() });
+    if let Some(name) = unknown_section(&file) {
+        return Err(ConfigError::Section { path: path.to_owned(), name: name.to_owned() });
     }
     match file.remove("eval") {
         None => Ok(toml::Table::new()),
         Some(toml::Value::Table(table)) => Ok(table),
         Some(other) => Err(syntax(format!("eval: expected a table, got {}", other.type_str()))),
     }
-}
-
-/// Puts `a.b=value` into a table; a value that is no TOML is a text.
-fn apply(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
-    let refuse =
-        |message: &str| ConfigError::Syntax { place: format!("--set {text}"), message: message.to_owned() };
-    let (path, value) = text.split_once('=').ok_or_else(|| refuse("expected key=value"))?;
-    let parsed =
-        format!("value = {value}").parse::<toml::Table>().ok().and_then(|mut one| one.remove("value"));
-    let value = parsed.unwrap_or_else(|| toml::Value::String(value.to_owned()));
-    let mut keys: Vec<&str> = path.split('.').collect();
-    let last = keys.pop().filter(|key| !key.is_empty()).ok_or_else(|| refuse("expected key=value"))?;
-    let mut inner = table;
-    for key in keys {
-        let entry = inner.entry(key.to_owned()).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-        inner = entry.as_table_mut().ok_or_else(|| refuse(&format!("{key} is no table")))?;
-    }
-    inner.insert(last.to_owned(), value);
-    Ok(())
 }
 
 #[cfg(test)]

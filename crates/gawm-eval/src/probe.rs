@@ -8,6 +8,7 @@ mod mlp;
 
 use gawm_model::{Stream, permutation};
 use rayon::prelude::*;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::diagnose::{Prediction, Trajectory};
@@ -18,7 +19,7 @@ use linear::Ridge;
 use mlp::Mlp;
 
 /// Settings of the probes.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ProbeOptions {
     /// Share of the episodes that probes are fitted on; the others score them.
@@ -27,7 +28,7 @@ pub struct ProbeOptions {
     pub ridge: f64,
     /// Hidden width of the two-layer probe.
     pub hidden: usize,
-    /// Passes over the data of the two-layer probe.
+    /// Passes over the data of the two-layer probe; more where there are so few rows that these are under 1500 steps.
     pub epochs: usize,
     /// Step of Adam.
     pub learning_rate: f64,
@@ -118,7 +119,7 @@ pub fn probe(
     let mut fitted = collect(trajectories, &train);
     thin(&mut fitted, d, s, options.max_rows);
     report.train_rows = fitted.x.len() / d;
-    let scale = Scale::fit(&fitted.x, d);
+    let scale = Scale::fit(fitted.x.iter().map(|value| f64::from(*value)), d);
     scale.apply(&mut fitted.x);
     let mut scored: Vec<(usize, Rows)> = vec![(0, collect(trajectories, &test))];
     let horizon = predictions.iter().map(|prediction| prediction.chunks).max().unwrap_or(0);
@@ -210,17 +211,19 @@ fn column(values: &[f64], width: usize, dim: usize) -> Vec<f64> {
     values.iter().skip(dim).step_by(width).copied().collect()
 }
 
-/// Mean and standard deviation of each value of a latent.
+/// Mean and standard deviation of each column; values that are not finite are left out.
+#[derive(Debug, Clone)]
 struct Scale {
     mean: Vec<f64>,
     std: Vec<f64>,
 }
 
 impl Scale {
-    fn fit(x: &[f32], d: usize) -> Scale {
-        let n = (x.len() / d).max(1) as f64;
+    /// Measures values [N, d], row-major.
+    fn fit(x: impl Iterator<Item = f64> + Clone, d: usize) -> Scale {
         let moment = |dim: usize| {
-            let values = || x.iter().skip(dim).step_by(d).map(|value| f64::from(*value));
+            let values = || x.clone().skip(dim).step_by(d).filter(|value| value.is_finite());
+            let n = values().count().max(1) as f64;
             let mean = values().sum::<f64>() / n;
             let std = (values().map(|value| (value - mean).powi(2)).sum::<f64>() / n).sqrt();
             (mean, if std.is_normal() { std } else { 1.0 })
@@ -236,6 +239,14 @@ impl Scale {
             }
         }
     }
+
+    fn undo(&self, x: &mut [f32]) {
+        for row in x.chunks_exact_mut(self.mean.len()) {
+            for ((value, mean), std) in row.iter_mut().zip(&self.mean).zip(&self.std) {
+                *value = (f64::from(*value) * std + mean) as f32;
+            }
+        }
+    }
 }
 
 #[cfg(test)]
@@ -248,7 +259,8 @@ mod tests {
         let x = stream.normals(n * 6);
         let y = x.chunks_exact(6).flat_map(|row| {
             let [a, b, c] = [row[0], row[1], row[2]].map(f64::from);
-            [2.0 * a - b + 0.5, a * c]
+            // Far from zero, as a cosine near 1 is: a probe that cannot find the mean reads nothing.
+            [2.0 * a - b + 0.5, a * c, 50.0 + 0.1 * a]
         });
         (x.clone(), y.collect())
     }
@@ -257,16 +269,27 @@ mod tests {
     fn probes_read_what_is_there_and_no_more() {
         let ((x, y), (x_test, y_test)) = (data(4000, 1), data(1000, 2));
         let options = ProbeOptions { epochs: 40, ..ProbeOptions::default() };
-        let mlp = Mlp::fit(&x, &y, 6, 2, &options, 3).unwrap().predict(&x_test).unwrap();
+        let mlp = Mlp::fit(&x, &y, 6, 3, &options, 3).unwrap().predict(&x_test).unwrap();
         for (dim, linear_low, linear_high, mlp_low) in [(0, 0.999, 1.0, 0.98), (1, -0.1, 0.1, 0.9)] {
-            let target = column(&y_test, 2, dim);
-            let ridge = Ridge::fit(&x, &column(&y, 2, dim), 6, 1e-6);
+            let target = column(&y_test, 3, dim);
+            let ridge = Ridge::fit(&x, &column(&y, 3, dim), 6, 1e-6);
             let linear = score(&ridge.predict(&x_test), &target, 3.0);
             let r2 = linear.r2.unwrap();
             assert!((linear_low..=linear_high).contains(&r2), "dim {dim}: linear {r2}");
-            let read: Vec<f64> = mlp.iter().skip(dim).step_by(2).map(|value| f64::from(*value)).collect();
+            let read: Vec<f64> = mlp.iter().skip(dim).step_by(3).map(|value| f64::from(*value)).collect();
             let nonlinear = score(&read, &target, 3.0);
             assert!(nonlinear.r2.unwrap() > mlp_low, "dim {dim}: {nonlinear:?}");
+        }
+    }
+
+    #[test]
+    fn few_rows_and_targets_far_from_zero_are_read() {
+        let ((x, y), (x_test, y_test)) = (data(300, 4), data(300, 5));
+        let mlp = Mlp::fit(&x, &y, 6, 3, &ProbeOptions::default(), 3).unwrap().predict(&x_test).unwrap();
+        for dim in [0, 2] {
+            let read: Vec<f64> = mlp.iter().skip(dim).step_by(3).map(|value| f64::from(*value)).collect();
+            let r2 = score(&read, &column(&y_test, 3, dim), 1.0).r2.unwrap();
+            assert!(r2 > 0.9, "dim {dim}: {r2}");
         }
     }
 

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use gawm_model::{Device, WorldModel, checkpoint};
+use gawm_model::{Device, Objectives, WorldModel, checkpoint};
 use gawm_schema::batch::{Hello, HelloError, StandardisedDimInfo};
 use thiserror::Error;
 
@@ -127,8 +127,9 @@ impl Run {
         let checkpoint = checkpoint::load(&file, device)?;
         check(&hello, &checkpoint, &file)?;
         let folder = path.file_name().map(|name| name.to_string_lossy().into_owned());
-        let preset = config.get("objectives").and_then(|table| table.get("preset"));
-        let preset = preset.and_then(toml::Value::as_str).map(str::to_owned);
+        let objectives = config.get("objectives").and_then(toml::Value::as_table).cloned();
+        let objectives = objectives.and_then(|table| Objectives::from_table(table).ok());
+        let preset = objectives.and_then(|objectives| objectives.preset_name()).map(str::to_owned);
         let seed = config.get("train").and_then(|table| table.get("seed")).and_then(toml::Value::as_integer);
         Ok(Run {
             path: path.to_owned(),

@@ -6,6 +6,7 @@
 use std::hint::black_box;
 use std::time::Instant;
 
+use gawm_kernels::attention::{Attention, AttentionGradients, AttentionInputs, AttentionScratch};
 use gawm_kernels::gemm::{Epilogue, Lhs, Packed, Rhs, gemm};
 
 fn main() {
@@ -45,6 +46,34 @@ fn main() {
             "{m:>4} x {n:>4} x {k:>4}: forward {forward:>6.1} GFLOP/s, gradient of the weight {weight:>6.1}"
         );
     }
+    attention(257, 3, 64);
+    attention(65, 2, 32);
+}
+
+/// Prints what attention of one image reaches, its data in the cache.
+fn attention(tokens: usize, heads: usize, head_width: usize) {
+    let sizes = Attention { queries: tokens, keys: tokens, heads, head_width };
+    let count = tokens * heads * head_width;
+    let input = |shift: usize| -> Vec<f32> {
+        (0..count).map(|i| ((i * 7 + shift) % 13) as f32 * 0.1 - 0.6).collect()
+    };
+    let (q, k, v, d_output) = (input(0), input(1), input(2), input(3));
+    let inputs = AttentionInputs { q: &q, k: &k, v: &v };
+    let (mut output, mut sums, mut scratch) =
+        (vec![0.0; count], vec![0.0; heads * tokens], AttentionScratch::default());
+    let forward = rate(sizes.operations(), || {
+        sizes.forward(inputs, &mut output, &mut sums, &mut scratch);
+        black_box(&output);
+    });
+    let (mut dq, mut dk, mut dv) = (vec![0.0; count], vec![0.0; count], vec![0.0; count]);
+    let backward = rate(sizes.operations() * 5 / 2, || {
+        let mut gradients = AttentionGradients { q: &mut dq, k: &mut dk, v: &mut dv };
+        sizes.backward(inputs, (&output, &sums), &d_output, &mut gradients, &mut scratch);
+        black_box(&gradients);
+    });
+    println!(
+        "attention {tokens} tokens, {heads} heads of {head_width}: forward {forward:>6.1} GFLOP/s, backward {backward:>6.1}"
+    );
 }
 
 /// GFLOP/s of the fastest of 30 repeats of at least 2 milliseconds.

@@ -237,7 +237,22 @@ pub(crate) fn contiguous<'a>(values: &'a [f32], layout: &Layout) -> Result<&'a [
     }
 }
 
+/// Runs `work` on a thread of the pool, so that the parallel loops inside do not each hand over to one and wait.
+pub(crate) fn in_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
+    rayon::scope(|_| work())
+}
+
+/// Whether a tensor is f32 on the CPU.
+pub(crate) fn is_plain(tensor: &Tensor) -> bool {
+    tensor.device().is_cpu() && tensor.dtype() == DType::F32
+}
+
+/// Whether a tensor is a variable whose values lie in a row: its gradient can go to a [`GradientSink`].
+pub(crate) fn is_parameter(tensor: &Tensor) -> bool {
+    is_plain(tensor) && tensor.is_variable() && tensor.is_contiguous()
+}
+
 /// Locks a value that is whole between any two statements, so that a panic elsewhere does not spoil it.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

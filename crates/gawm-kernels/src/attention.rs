@@ -9,10 +9,10 @@
 //! row's sum; backward computes the probabilities again from it.
 
 use crate::gemm::{ACCUMULATE, Epilogue, Lhs, Packed, Rhs, STORE, gemm, panel_width};
-use crate::simd::{dot, exp, max_of, mul_add, sum, vectorized};
+use crate::simd::{LANES, dot, exp, fold, max_of, mul_add, vectorized};
 
 /// Queries per block: a multiple of every register tile.
-const BLOCK: usize = 48;
+const BLOCK: usize = 72;
 
 /// Sizes of one image's attention. Rows of queries, keys, values and outputs hold all heads, side by side.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -94,6 +94,7 @@ impl Attention {
     ) {
         let (width, d, padded) = (self.width(), self.head_width, self.padded_keys());
         scratch.scores.resize(BLOCK * padded, 0.0);
+        scratch.products.resize(BLOCK, 0.0);
         for head in 0..self.heads {
             let first = head * d;
             scratch.keys.fill(&inputs.k[first..], [d, self.keys], [1, width]);
@@ -102,10 +103,14 @@ impl Attention {
                 let q = Lhs { values: &inputs.q[start * width + first..], row_stride: width, k_stride: 1 };
                 gemm([rows, padded, d], q, Rhs::Packed(&scratch.keys), &mut scratch.scores, padded, STORE);
                 let sums = &mut log_sums[head * self.queries + start..][..rows];
-                softmax_rows(&mut scratch.scores[..rows * padded], padded, self.keys, self.scale(), sums);
+                let weights = &mut scratch.scores[..rows * padded];
+                let inverses = &mut scratch.products[..rows];
+                softmax_rows(weights, [padded, self.keys], self.scale(), sums, inverses);
                 let p = Lhs { values: &scratch.scores, row_stride: padded, k_stride: 1 };
                 let v = Rhs::Rows { values: &inputs.v[first..], stride: width };
-                gemm([rows, d, self.keys], p, v, &mut output[start * width + first..], width, STORE);
+                let output = &mut output[start * width + first..];
+                gemm([rows, d, self.keys], p, v, output, width, STORE);
+                scale_rows(output, width, d, &scratch.products[..rows]);
             }
         }
     }
@@ -156,7 +161,7 @@ impl Attention {
                 row_products(&output[at..], &d_output[at..], width, d, &mut scratch.products[..rows]);
                 let log_sums = &log_sums[head * self.queries + start..][..rows];
                 let (p, ds) = (&mut scratch.scores[..rows * padded], &mut scratch.gradients[..rows * padded]);
-                softmax_backward_rows(p, ds, [padded, self.keys], self.scale(), log_sums, &scratch.products);
+                softmax_backward_rows(p, ds, padded, self.scale(), log_sums, &scratch.products);
 
                 let then = if start == 0 { STORE } else { ACCUMULATE };
                 let (p, ds) = (&scratch.scores, &scratch.gradients);
@@ -193,40 +198,75 @@ impl Attention {
 }
 
 vectorized! {
-    /// Turns rows of scores into probabilities, `softmax(scale * x)` over the first `count` columns of each row of
-    /// `stride` elements; writes `ln(sum(exp(scale * x)))` of each row.
-    pub fn softmax_rows(scores: &mut [f32], stride: usize, count: usize, scale: f32, log_sums: &mut [f32]) {
-        for (row, log_sum) in scores.chunks_exact_mut(stride).zip(log_sums) {
-            let row = &mut row[..count];
-            let largest = max_of(row);
-            for x in row.iter_mut() {
+    /// Turns rows of scores into `exp(scale * (x - largest))` over the first `count` columns of each row of `stride`
+    /// elements, and zeros beyond; writes `ln(sum(exp(scale * x)))` of each row, and what its weights are to be multiplied
+    /// by to add up to 1.
+    fn softmax_rows(
+        scores: &mut [f32],
+        sizes: [usize; 2],
+        scale: f32,
+        log_sums: &mut [f32],
+        inverses: &mut [f32],
+    ) {
+        let [stride, count] = sizes;
+        // Row after row in each pass, so that the end of one row's reduction overlaps with the next row.
+        for (row, largest) in scores.chunks_exact_mut(stride).zip(inverses.iter_mut()) {
+            // Beyond the last key too, so that whole vectors are left.
+            row[count..].fill(f32::NEG_INFINITY);
+            *largest = max_of(row);
+        }
+        let rows = scores.chunks_exact_mut(stride).zip(inverses.iter_mut()).zip(log_sums.iter_mut());
+        for ((row, inverse), log_sum) in rows {
+            let largest = *inverse;
+            let one = |x: &mut f32, lane: &mut f32| {
                 *x = exp::<FMA>((*x - largest) * scale);
+                *lane += *x;
+            };
+            let mut lanes = [0f32; LANES];
+            let (vectors, rest) = row.as_chunks_mut::<LANES>();
+            for vector in vectors {
+                vector.iter_mut().zip(&mut lanes).for_each(|(x, lane)| one(x, lane));
             }
-            let total = sum(row);
-            let inverse = 1.0 / total;
-            for x in row.iter_mut() {
-                *x *= inverse;
-            }
-            *log_sum = mul_add::<FMA>(largest, scale, total.ln());
+            rest.iter_mut().zip(&mut lanes).for_each(|(x, lane)| one(x, lane));
+            *inverse = fold(lanes, |a, b| a + b);
+            *log_sum = largest * scale;
+        }
+        for (log_sum, inverse) in log_sums.iter_mut().zip(inverses.iter_mut()) {
+            *log_sum += inverse.ln();
+            *inverse = 1.0 / *inverse;
         }
     }
 
-    /// Turns rows of scores into probabilities again, and rows of `dP` into `scale * P * (dP - product)`.
+    /// Multiplies the first `count` elements of each row of `stride` elements by the row's factor.
+    fn scale_rows(values: &mut [f32], stride: usize, count: usize, factors: &[f32]) {
+        for (row, factor) in factors.iter().enumerate() {
+            for x in &mut values[row * stride..][..count] {
+                *x *= factor;
+            }
+        }
+    }
+
+    /// Turns rows of scores into probabilities again, and rows of `dP` into `scale * P * (dP - product)`. Columns beyond
+    /// the last key hold numbers that nobody reads.
     fn softmax_backward_rows(
         scores: &mut [f32],
         gradients: &mut [f32],
-        sizes: [usize; 2],
+        stride: usize,
         scale: f32,
         log_sums: &[f32],
         products: &[f32],
     ) {
-        let [stride, count] = sizes;
         let rows = scores.chunks_exact_mut(stride).zip(gradients.chunks_exact_mut(stride));
         for (((p, ds), log_sum), product) in rows.zip(log_sums).zip(products) {
-            for (p, ds) in p[..count].iter_mut().zip(&mut ds[..count]) {
+            let one = |p: &mut f32, ds: &mut f32| {
                 *p = exp::<FMA>(mul_add::<FMA>(*p, scale, -log_sum));
                 *ds = *p * (*ds - product) * scale;
+            };
+            let ((p, p_rest), (ds, ds_rest)) = (p.as_chunks_mut::<LANES>(), ds.as_chunks_mut::<LANES>());
+            for (p, ds) in p.iter_mut().zip(ds) {
+                p.iter_mut().zip(ds).for_each(|(p, ds)| one(p, ds));
             }
+            p_rest.iter_mut().zip(ds_rest).for_each(|(p, ds)| one(p, ds));
         }
     }
 

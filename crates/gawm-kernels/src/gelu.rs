@@ -18,6 +18,13 @@ vectorized! {
         }
     }
 
+    /// Turns `x` into its GELU.
+    pub fn gelu_in_place(x: &mut [f32]) {
+        for x in x.iter_mut() {
+            *x *= normal_cdf::<FMA>(*x);
+        }
+    }
+
     /// Writes the GELU of `x` to `y` and multiplies `dy`, the gradient of `y`, by its derivative: the gradient of `x`.
     ///
     /// # Panics

@@ -8,6 +8,11 @@
 //! (A is never copied), a row of B is two vectors, either from a matrix or from a panel made by [`Packed`].
 
 use crate::simd::{Level, level};
+#[cfg(target_arch = "x86_64")]
+use crate::vector::x86;
+use crate::vector::{Four, Vector};
+
+pub use crate::pack::{Packed, panel_width};
 
 /// The left operand, read element by element: `a(i, k) = values[i * row_stride + k * k_stride]`.
 #[derive(Debug, Clone, Copy)]
@@ -48,114 +53,6 @@ pub const STORE: Epilogue<'static> = Epilogue { accumulate: false, bias: None };
 /// Adds to the output.
 pub const ACCUMULATE: Epilogue<'static> = Epilogue { accumulate: true, bias: None };
 
-/// A right operand in panels of [`panel_width`] columns: `[panels][k][width]`, the last one filled up with zeros.
-#[derive(Debug, Clone, Default)]
-pub struct Packed {
-    values: Vec<f32>,
-    width: usize,
-    k: usize,
-    n: usize,
-}
-
-impl Packed {
-    /// Packs `b(k, n) = values[k * k_stride + n * n_stride]`, reusing the memory of this panel.
-    ///
-    /// # Panics
-    ///
-    /// If `values` is too short.
-    pub fn fill(&mut self, values: &[f32], [k, n]: [usize; 2], [k_stride, n_stride]: [usize; 2]) {
-        let width = panel_width();
-        assert!(
-            k == 0 || n == 0 || (k - 1) * k_stride + (n - 1) * n_stride < values.len(),
-            "pack: too few values"
-        );
-        (self.width, self.k, self.n) = (width, k, n);
-        self.values.resize(n.div_ceil(width) * width * k, 0.0);
-        if k == 0 {
-            return;
-        }
-        for (panel, out) in self.values.chunks_exact_mut(width * k).enumerate() {
-            let first = panel * width;
-            let columns = width.min(n - first);
-            if n_stride == 1 {
-                for (row, out) in out.chunks_exact_mut(width).enumerate() {
-                    let start = row * k_stride + first;
-                    out[..columns].copy_from_slice(&values[start..start + columns]);
-                    out[columns..].fill(0.0);
-                }
-            } else if k_stride == 1 {
-                transpose(&values[first * n_stride..], n_stride, [columns, k], out, width);
-            } else {
-                for column in 0..columns {
-                    let source = values[(first + column) * n_stride..].iter().step_by(k_stride);
-                    for (out, value) in out[column..].iter_mut().step_by(width).zip(source) {
-                        *out = *value;
-                    }
-                }
-                for out in out.chunks_exact_mut(width) {
-                    out[columns..].fill(0.0);
-                }
-            }
-        }
-    }
-
-    /// Packs the transpose of a weight `[n, k]`, as [`Packed::fill`] does.
-    pub fn of_transposed(values: &[f32], [n, k]: [usize; 2]) -> Packed {
-        let mut packed = Packed::default();
-        packed.fill(values, [k, n], [1, k]);
-        packed
-    }
-
-    /// Packs a matrix `[k, n]`, as [`Packed::fill`] does.
-    pub fn of(values: &[f32], [k, n]: [usize; 2]) -> Packed {
-        let mut packed = Packed::default();
-        packed.fill(values, [k, n], [n, 1]);
-        packed
-    }
-
-    /// Number of columns, without the zeros of the last panel.
-    pub fn columns(&self) -> usize {
-        self.n
-    }
-}
-
-/// Writes the transpose of `rows` x `k` values, whose rows are `stride` apart, to rows of `width` elements; those beyond
-/// `rows` become zero.
-fn transpose(values: &[f32], stride: usize, [rows, k]: [usize; 2], out: &mut [f32], width: usize) {
-    let whole = rows - rows % 4;
-    for first in (0..whole).step_by(4) {
-        let row = |index: usize| values[(first + index) * stride..][..k].chunks_exact(4);
-        let tiles = row(0).zip(row(1)).zip(row(2)).zip(row(3));
-        for ((((a, b), c), d), out) in tiles.zip(out.chunks_exact_mut(4 * width)) {
-            // Four by four, which becomes shuffles of registers.
-            for lane in 0..4 {
-                let target = &mut out[lane * width + first..][..4];
-                target.copy_from_slice(&[a[lane], b[lane], c[lane], d[lane]]);
-            }
-        }
-        for kk in k - k % 4..k {
-            for index in 0..4 {
-                out[kk * width + first + index] = values[(first + index) * stride + kk];
-            }
-        }
-    }
-    for (kk, out) in out.chunks_exact_mut(width).enumerate() {
-        for (index, out) in out[whole..rows].iter_mut().enumerate() {
-            *out = values[(whole + index) * stride + kk];
-        }
-        out[rows..].fill(0.0);
-    }
-}
-
-/// Number of columns of a register tile at the level in use.
-pub fn panel_width() -> usize {
-    match level() {
-        Level::Avx512 => 32,
-        Level::Avx2 => 16,
-        Level::Portable => 8,
-    }
-}
-
 /// Computes `C = A B`, with `C [m, n]` in rows of `c_stride` elements and a sum over `k` terms.
 ///
 /// # Panics
@@ -168,6 +65,44 @@ pub fn gemm(
     c: &mut [f32],
     c_stride: usize,
     epilogue: Epilogue<'_>,
+) {
+    product([m, n, k], a, b, c, c_stride, epilogue, Terms::Single);
+}
+
+/// [`gemm`] of operands in pairs ([`crate::pairs`]): `k` counts pairs.
+///
+/// # Panics
+///
+/// As [`gemm`], and if the processor has no such instruction ([`crate::pairs::available`]).
+pub fn gemm_pairs(
+    sizes: [usize; 3],
+    a: Lhs<'_>,
+    b: Rhs<'_>,
+    c: &mut [f32],
+    c_stride: usize,
+    epilogue: Epilogue<'_>,
+) {
+    assert!(crate::pairs::available(), "gemm: expected a processor with avx512_bf16");
+    product(sizes, a, b, c, c_stride, epilogue, Terms::Pairs);
+}
+
+/// What an element of an operand holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Terms {
+    /// A value.
+    Single,
+    /// Two values in bf16.
+    Pairs,
+}
+
+fn product(
+    [m, n, k]: [usize; 3],
+    a: Lhs<'_>,
+    b: Rhs<'_>,
+    c: &mut [f32],
+    c_stride: usize,
+    epilogue: Epilogue<'_>,
+    terms: Terms,
 ) {
     if m == 0 || n == 0 {
         return;
@@ -187,7 +122,7 @@ pub fn gemm(
             assert!((k - 1) * stride + n <= values.len(), "gemm: right operand is too short");
         }
         Rhs::Packed(packed) => {
-            let fits = (packed.width, packed.k) == (width, k) && n * k <= packed.values.len();
+            let fits = packed.fits(k, n);
             assert!(fits, "gemm: packed for other sizes");
         }
     }
@@ -198,16 +133,22 @@ pub fn gemm(
     {
         rest.fill(&values[n - n % width..], [k, n % width], [stride, 1]);
     }
-    let job = Job { m, n, k, a, b, rest: &rest.values, c: c.as_mut_ptr(), c_stride, epilogue };
+    let job = Job { m, n, k, a, b, rest: rest.values(), c: c.as_mut_ptr(), c_stride, epilogue, terms };
     match level() {
+        // SAFETY: `gemm_pairs` found the instruction; the assertions above are the preconditions of `Job::run`.
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512 if job.terms == Terms::Pairs => unsafe { run_pairs(&job) },
         // SAFETY: AVX-512 F is there at this level; the assertions above are the preconditions of `Job::run`.
         #[cfg(target_arch = "x86_64")]
         Level::Avx512 => unsafe { run_avx512(&job) },
         // SAFETY: AVX2 and FMA are there at this level; the assertions above are the preconditions of `Job::run`.
         #[cfg(target_arch = "x86_64")]
         Level::Avx2 => unsafe { run_avx2(&job) },
-        // SAFETY: this level needs nothing; the assertions above are the preconditions of `Job::run`.
-        _ => unsafe { job.run::<Four>() },
+        _ => {
+            debug_assert_eq!(job.terms, Terms::Single, "gemm: pairs need a level of their own");
+            // SAFETY: this level needs nothing; the assertions above are the preconditions of `Job::run`.
+            unsafe { job.run::<Four>() }
+        }
     }
 }
 
@@ -233,6 +174,7 @@ struct Job<'a> {
     c: *mut f32,
     c_stride: usize,
     epilogue: Epilogue<'a>,
+    terms: Terms,
 }
 
 /// Widest tile of any level, in elements.
@@ -252,7 +194,7 @@ impl Job<'_> {
         for first in (0..self.n).step_by(width) {
             let columns = width.min(self.n - first);
             let (b, stride) = match self.b {
-                Rhs::Packed(packed) => (packed.values[first * self.k..].as_ptr(), width),
+                Rhs::Packed(packed) => (packed.values()[first * self.k..].as_ptr(), width),
                 Rhs::Rows { values, stride } if columns == width => (values[first..].as_ptr(), stride),
                 Rhs::Rows { .. } => (self.rest.as_ptr(), width),
             };
@@ -268,7 +210,7 @@ impl Job<'_> {
 }
 
 /// One tile of the result: up to `V::ROWS` rows and two vectors.
-struct Tile<'a> {
+pub(crate) struct Tile<'a> {
     job: &'a Job<'a>,
     row: usize,
     first: usize,
@@ -289,33 +231,33 @@ impl Tile<'_> {
         unsafe {
             if self.columns <= V::LANES {
                 match rows {
-                    1 => self.run::<V, 1, 1>(),
-                    2 => self.run::<V, 2, 1>(),
-                    3 => self.run::<V, 3, 1>(),
-                    4 => self.run::<V, 4, 1>(),
-                    5 => self.run::<V, 5, 1>(),
-                    6 => self.run::<V, 6, 1>(),
-                    7 => self.run::<V, 7, 1>(),
-                    8 => self.run::<V, 8, 1>(),
-                    9 => self.run::<V, 9, 1>(),
-                    10 => self.run::<V, 10, 1>(),
-                    11 => self.run::<V, 11, 1>(),
-                    _ => self.run::<V, 12, 1>(),
+                    1 => V::tile::<1, 1>(self),
+                    2 => V::tile::<2, 1>(self),
+                    3 => V::tile::<3, 1>(self),
+                    4 => V::tile::<4, 1>(self),
+                    5 => V::tile::<5, 1>(self),
+                    6 => V::tile::<6, 1>(self),
+                    7 => V::tile::<7, 1>(self),
+                    8 => V::tile::<8, 1>(self),
+                    9 => V::tile::<9, 1>(self),
+                    10 => V::tile::<10, 1>(self),
+                    11 => V::tile::<11, 1>(self),
+                    _ => V::tile::<12, 1>(self),
                 }
             } else {
                 match rows {
-                    1 => self.run::<V, 1, 2>(),
-                    2 => self.run::<V, 2, 2>(),
-                    3 => self.run::<V, 3, 2>(),
-                    4 => self.run::<V, 4, 2>(),
-                    5 => self.run::<V, 5, 2>(),
-                    6 => self.run::<V, 6, 2>(),
-                    7 => self.run::<V, 7, 2>(),
-                    8 => self.run::<V, 8, 2>(),
-                    9 => self.run::<V, 9, 2>(),
-                    10 => self.run::<V, 10, 2>(),
-                    11 => self.run::<V, 11, 2>(),
-                    _ => self.run::<V, 12, 2>(),
+                    1 => V::tile::<1, 2>(self),
+                    2 => V::tile::<2, 2>(self),
+                    3 => V::tile::<3, 2>(self),
+                    4 => V::tile::<4, 2>(self),
+                    5 => V::tile::<5, 2>(self),
+                    6 => V::tile::<6, 2>(self),
+                    7 => V::tile::<7, 2>(self),
+                    8 => V::tile::<8, 2>(self),
+                    9 => V::tile::<9, 2>(self),
+                    10 => V::tile::<10, 2>(self),
+                    11 => V::tile::<11, 2>(self),
+                    _ => V::tile::<12, 2>(self),
                 }
             }
         }
@@ -329,7 +271,7 @@ impl Tile<'_> {
     /// - Rows `row..row + ROWS` of A and C exist; `b` holds `k` rows of `2 * V::LANES` elements, `b_stride` apart;
     ///   columns `first..first + columns` of C and of the bias exist.
     #[inline(always)]
-    unsafe fn run<V: Vector, const ROWS: usize, const VECTORS: usize>(&self) {
+    pub(crate) unsafe fn run<V: Vector, const ROWS: usize, const VECTORS: usize>(&self) {
         let job = self.job;
         let a_k = job.a.k_stride;
         let mut a = [job.a.values.as_ptr(); ROWS];
@@ -369,182 +311,87 @@ impl Tile<'_> {
     #[inline(always)]
     unsafe fn write<V: Vector, const ROWS: usize, const VECTORS: usize>(&self, sums: &[[V; VECTORS]; ROWS]) {
         let Epilogue { accumulate, bias } = self.job.epilogue;
-        let whole = self.columns == VECTORS * V::LANES;
-        for (i, sums) in sums.iter().enumerate() {
-            // SAFETY: row + i < m and first + columns <= n, so that the row of C holds `columns` elements from here on,
-            // and so does the bias; whole vectors are only read and written when `columns` fills them. The spill is
-            // 32 elements wide, as the widest tile.
-            unsafe {
-                let c = self.job.c.add((self.row + i) * self.job.c_stride + self.first);
-                if whole {
-                    for (v, sum) in sums.iter().enumerate() {
-                        let mut value = *sum;
-                        if let Some(bias) = bias {
-                            value = V::add(value, V::load(bias.as_ptr().add(self.first + v * V::LANES)));
-                        }
-                        let c = c.add(v * V::LANES);
-                        if accumulate {
-                            value = V::add(value, V::load(c));
-                        }
-                        V::store(value, c);
-                    }
-                } else {
-                    let mut spill = [0f32; WIDEST];
-                    for (v, sum) in sums.iter().enumerate() {
-                        V::store(*sum, spill.as_mut_ptr().add(v * V::LANES));
-                    }
-                    for (column, value) in spill[..self.columns].iter().enumerate() {
-                        let kept = if accumulate { *c.add(column) } else { 0.0 };
-                        *c.add(column) = kept + (value + bias.map_or(0.0, |bias| bias[self.first + column]));
-                    }
+        // SAFETY: row + i < m and first + columns <= n, so that each row of C holds `columns` elements from here on, and
+        // so does the bias; whole vectors are only read and written when `columns` fills them.
+        unsafe {
+            let c = self.job.c.add(self.row * self.job.c_stride + self.first);
+            if self.columns != VECTORS * V::LANES {
+                return self.write_part(sums, c);
+            }
+            let mut shift = [V::zero(); VECTORS];
+            if let Some(bias) = bias {
+                for (v, shift) in shift.iter_mut().enumerate() {
+                    *shift = V::load(bias.as_ptr().add(self.first + v * V::LANES));
+                }
+            }
+            // Three loops and not one with branches inside: unrolled, they leave the sums in their registers.
+            match (accumulate, bias.is_some()) {
+                (false, false) => self.store_rows(sums, c, |sum, _, _| sum),
+                (true, false) => self.store_rows(sums, c, |sum, _, c| V::add(sum, V::load(c))),
+                (false, true) => self.store_rows(sums, c, |sum, v, _| V::add(sum, shift[v])),
+                (true, true) => {
+                    self.store_rows(sums, c, |sum, v, c| V::add(V::add(sum, shift[v]), V::load(c)))
                 }
             }
         }
     }
-}
 
-/// A vector register.
-trait Vector: Copy {
-    /// Elements of a register.
-    const LANES: usize;
-    /// Rows of a tile: as many as leave registers for B and a broadcast, and at most 12.
-    const ROWS: usize;
+    /// Writes `value(sum, index of the vector, where it goes)` for every sum.
+    ///
     /// # Safety
     ///
-    /// Needs the instructions of the type.
-    unsafe fn zero() -> Self;
-    /// # Safety
-    ///
-    /// Needs the instructions of the type, and `LANES` elements to read.
-    unsafe fn load(from: *const f32) -> Self;
-    /// # Safety
-    ///
-    /// Needs the instructions of the type, and `LANES` elements to write.
-    unsafe fn store(self, to: *mut f32);
-    /// # Safety
-    ///
-    /// Needs the instructions of the type.
-    unsafe fn splat(value: f32) -> Self;
-    /// # Safety
-    ///
-    /// Needs the instructions of the type.
-    unsafe fn mul_add(self, b: Self, c: Self) -> Self;
-    /// # Safety
-    ///
-    /// Needs the instructions of the type.
-    unsafe fn add(self, b: Self) -> Self;
-}
-
-/// Four lanes that every target has.
-#[derive(Clone, Copy)]
-struct Four([f32; 4]);
-
-impl Vector for Four {
-    const LANES: usize = 4;
-    const ROWS: usize = 4;
+    /// `c` is followed by as many elements as the rows of whole vectors have, each `c_stride` after the last; the rest is
+    /// as for [`Tile::run`].
     #[inline(always)]
-    unsafe fn zero() -> Self {
-        Four([0.0; 4])
-    }
-    #[inline(always)]
-    unsafe fn load(from: *const f32) -> Self {
-        // SAFETY: the caller has four elements to read; the type has the alignment of its elements.
-        Four(unsafe { from.cast::<[f32; 4]>().read() })
-    }
-    #[inline(always)]
-    unsafe fn store(self, to: *mut f32) {
-        // SAFETY: the caller has four elements to write; the type has the alignment of its elements.
-        unsafe { to.cast::<[f32; 4]>().write(self.0) }
-    }
-    #[inline(always)]
-    unsafe fn splat(value: f32) -> Self {
-        Four([value; 4])
-    }
-    #[inline(always)]
-    unsafe fn mul_add(self, b: Self, c: Self) -> Self {
-        Four(std::array::from_fn(|i| self.0[i] * b.0[i] + c.0[i]))
-    }
-    #[inline(always)]
-    unsafe fn add(self, b: Self) -> Self {
-        Four(std::array::from_fn(|i| self.0[i] + b.0[i]))
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-mod x86 {
-    use std::arch::x86_64::*;
-
-    use super::Vector;
-
-    /// Implements [`Vector`] by the intrinsics of one set of instructions.
-    macro_rules! vector {
-        ($name:ident, $register:ty, $lanes:literal, $rows:literal, $zero:ident, $load:ident, $store:ident, $splat:ident, $fma:ident, $add:ident) => {
-            #[derive(Clone, Copy)]
-            pub(super) struct $name($register);
-
-            impl Vector for $name {
-                const LANES: usize = $lanes;
-                const ROWS: usize = $rows;
-                #[inline(always)]
-                unsafe fn zero() -> Self {
-                    // SAFETY: the caller has these instructions.
-                    $name(unsafe { $zero() })
-                }
-                #[inline(always)]
-                unsafe fn load(from: *const f32) -> Self {
-                    // SAFETY: the caller has these instructions and the elements; the load needs no alignment.
-                    $name(unsafe { $load(from) })
-                }
-                #[inline(always)]
-                unsafe fn store(self, to: *mut f32) {
-                    // SAFETY: the caller has these instructions and the elements; the store needs no alignment.
-                    unsafe { $store(to, self.0) }
-                }
-                #[inline(always)]
-                unsafe fn splat(value: f32) -> Self {
-                    // SAFETY: the caller has these instructions.
-                    $name(unsafe { $splat(value) })
-                }
-                #[inline(always)]
-                unsafe fn mul_add(self, b: Self, c: Self) -> Self {
-                    // SAFETY: the caller has these instructions.
-                    $name(unsafe { $fma(self.0, b.0, c.0) })
-                }
-                #[inline(always)]
-                unsafe fn add(self, b: Self) -> Self {
-                    // SAFETY: the caller has these instructions.
-                    $name(unsafe { $add(self.0, b.0) })
+    unsafe fn store_rows<V: Vector, const ROWS: usize, const VECTORS: usize>(
+        &self,
+        sums: &[[V; VECTORS]; ROWS],
+        mut c: *mut f32,
+        value: impl Fn(V, usize, *const f32) -> V,
+    ) {
+        for sums in sums {
+            for (v, sum) in sums.iter().enumerate() {
+                // SAFETY: the caller's promise.
+                unsafe {
+                    let c = c.add(v * V::LANES);
+                    V::store(value(*sum, v, c), c);
                 }
             }
-        };
+            // Wrapping, since the step after the last row may leave the output; it is not written there.
+            c = c.wrapping_add(self.job.c_stride);
+        }
     }
 
-    // 32 registers: 24 sums, 2 of B, 1 broadcast. 14 rows would fit, but not the pointers to them.
-    vector!(
-        Sixteen,
-        __m512,
-        16,
-        12,
-        _mm512_setzero_ps,
-        _mm512_loadu_ps,
-        _mm512_storeu_ps,
-        _mm512_set1_ps,
-        _mm512_fmadd_ps,
-        _mm512_add_ps
-    );
-    // 16 registers: 12 sums, 2 of B, 1 broadcast.
-    vector!(
-        Eight,
-        __m256,
-        8,
-        6,
-        _mm256_setzero_ps,
-        _mm256_loadu_ps,
-        _mm256_storeu_ps,
-        _mm256_set1_ps,
-        _mm256_fmadd_ps,
-        _mm256_add_ps
-    );
+    /// Writes a tile of which only some columns belong to the output, which begins at `c`.
+    ///
+    /// # Safety
+    ///
+    /// As [`Tile::run`].
+    #[inline(always)]
+    unsafe fn write_part<V: Vector, const ROWS: usize, const VECTORS: usize>(
+        &self,
+        sums: &[[V; VECTORS]; ROWS],
+        c: *mut f32,
+    ) {
+        let mut spill = [[0f32; WIDEST]; ROWS];
+        for (spill, sums) in spill.iter_mut().zip(sums) {
+            for (v, sum) in sums.iter().enumerate() {
+                // SAFETY: the spill is 32 elements wide, as the widest tile.
+                unsafe { V::store(*sum, spill.as_mut_ptr().add(v * V::LANES)) };
+            }
+        }
+        let Epilogue { accumulate, bias } = self.job.epilogue;
+        for (i, spill) in spill.iter().enumerate() {
+            for (column, value) in spill[..self.columns].iter().enumerate() {
+                // SAFETY: row + i < m and first + columns <= n.
+                unsafe {
+                    let c = c.add(i * self.job.c_stride + column);
+                    let kept = if accumulate { *c } else { 0.0 };
+                    *c = kept + (value + bias.map_or(0.0, |bias| bias[self.first + column]));
+                }
+            }
+        }
+    }
 }
 
 /// # Safety
@@ -555,6 +402,16 @@ mod x86 {
 unsafe fn run_avx512(job: &Job<'_>) {
     // SAFETY: the caller's promise.
     unsafe { job.run::<x86::Sixteen>() }
+}
+
+/// # Safety
+///
+/// As [`Job::run`], on a processor with AVX-512 F and BF16.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512bf16,avx2,fma")]
+unsafe fn run_pairs(job: &Job<'_>) {
+    // SAFETY: the caller's promise.
+    unsafe { job.run::<x86::Pairs>() }
 }
 
 /// # Safety

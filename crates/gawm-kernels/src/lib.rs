@@ -7,12 +7,15 @@
 //! |---|---|---|
 //! | transformer from frames to class tokens | [`vit::Vit`] | [`VitEncoder`] |
 //! | latents under actions, for planners | [`rollout::Rollout`] | [`rollout::Roller`] |
+//! | predictor in training | [`predictor::PredictorShape`] | [`predictor::Predictor`] |
+//! | projectors and heads | [`head::HeadShape`] | [`head::Head`] |
 //! | linear layers | [`linear::LinearShape`] | [`linear::linear`] |
 //! | AdamW with clipping | [`adamw::update`] | [`adamw::adamw`], [`adamw::squared_norm`] |
 //! | bytes to standardised planes | | [`pixels::standardize`] |
 //!
 //! They are made of [`gemm`], [`attention`], [`norm`] and [`gelu`]. `gawm-model` calls them where a composed expression
-//! stood; that expression stays for other devices and precisions, and is what tests compare with.
+//! stood; that expression stays for other devices, and is what tests compare with. Operands of the transformer's linear
+//! layers may be rounded to bf16 ([`pairs`], [`vit::Products`]).
 //!
 //! # Decision: parallel over data, not over operations
 //!
@@ -26,10 +29,12 @@
 
 mod simd;
 
-pub mod memory;
 pub mod profile;
 
 pub mod gemm;
+mod pack;
+pub mod pairs;
+mod vector;
 
 pub mod attention;
 pub mod gelu;
@@ -40,9 +45,12 @@ pub mod vit;
 mod adapter;
 
 pub mod adamw;
+pub mod head;
 pub mod linear;
 pub mod pixels;
+pub mod predictor;
 pub mod rollout;
+mod rows;
 
 pub use adapter::{GradientSink, VitEncoder};
 pub use simd::{Level, detect, level, limit_level};

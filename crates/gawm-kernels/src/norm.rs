@@ -90,6 +90,45 @@ vectorized! {
         }
     }
 
+    /// Adds the columns of the squares of `x`, `[rows, width]`, to `sums`, `[width]`.
+    pub fn add_squares(x: &[f32], sums: &mut [f32]) {
+        for row in x.chunks_exact(sums.len()) {
+            for (sum, x) in sums.iter_mut().zip(row) {
+                *sum = mul_add::<FMA>(*x, *x, *sum);
+            }
+        }
+    }
+
+    /// Subtracts `row` from each row of `x`.
+    pub fn subtract_row(row: &[f32], x: &mut [f32]) {
+        for x in x.chunks_exact_mut(row.len()) {
+            for (x, row) in x.iter_mut().zip(row) {
+                *x -= row;
+            }
+        }
+    }
+
+    /// Multiplies each row of `x` by `row`.
+    pub fn multiply_row(row: &[f32], x: &mut [f32]) {
+        for x in x.chunks_exact_mut(row.len()) {
+            for (x, row) in x.iter_mut().zip(row) {
+                *x *= row;
+            }
+        }
+    }
+
+    /// Backward of a batch norm: `dy = scale * (dy - mean - xhat * along)`, where `mean` and `along` are the means over the
+    /// batch of `dy` and of `dy * xhat`, and `scale` is `rstd * weight`, all per column.
+    pub fn batch_backward(dy: &mut [f32], xhat: &[f32], scale: &[f32], mean: &[f32], along: &[f32]) {
+        let width = scale.len();
+        for (dy, xhat) in dy.chunks_exact_mut(width).zip(xhat.chunks_exact(width)) {
+            let columns = scale.iter().zip(mean).zip(along);
+            for ((dy, xhat), ((scale, mean), along)) in dy.iter_mut().zip(xhat).zip(columns) {
+                *dy = scale * mul_add::<FMA>(-along, *xhat, *dy - mean);
+            }
+        }
+    }
+
     /// Adds `x` to `y`, element by element.
     pub fn add(x: &[f32], y: &mut [f32]) {
         for (y, x) in y.iter_mut().zip(x) {

@@ -27,6 +27,8 @@ pub enum Kind {
     Norm,
     /// GELU, both directions.
     Gelu,
+    /// Gates, dropout, SiLU and positions of the predictor.
+    Pointwise,
     /// Sums over rows: gradients of biases and of the position table.
     ColumnSums,
     /// Adding up the gradients of groups of images.
@@ -36,7 +38,7 @@ pub enum Kind {
 }
 
 /// All kinds, in the order of the report.
-pub const KINDS: [Kind; 12] = [
+pub const KINDS: [Kind; 13] = [
     Kind::Patches,
     Kind::Packing,
     Kind::LinearForward,
@@ -46,6 +48,7 @@ pub const KINDS: [Kind; 12] = [
     Kind::AttentionBackward,
     Kind::Norm,
     Kind::Gelu,
+    Kind::Pointwise,
     Kind::ColumnSums,
     Kind::Reduction,
     Kind::Optimizer,

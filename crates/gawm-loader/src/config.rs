@@ -2,13 +2,12 @@
 
 use std::path::PathBuf;
 
+use gawm_schema::pipeline::{Override, OverrideError, SECTIONS, unknown_section};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Sections that a pipeline may have; each program reads its own.
-const SECTIONS: [&str; 7] = ["sim", "ingest", "loader", "model", "objectives", "train", "eval"];
-
 /// How clips are made of datasets.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LoaderConfig {
     /// `repaired` (default): clips span only the rows they use, the split is by episode, statistics are those of the
@@ -52,7 +51,7 @@ pub struct LoaderConfig {
 }
 
 /// A further dataset.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct MixEntry {
     /// Its folder.
@@ -67,7 +66,7 @@ fn one() -> f64 {
 }
 
 /// Whose semantics.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Compat {
     /// Ours.
@@ -78,7 +77,7 @@ pub enum Compat {
 }
 
 /// What is held out.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum SplitRule {
     /// Episodes that the dataset marks.
@@ -128,12 +127,9 @@ pub enum ConfigError {
         /// The name.
         name: String,
     },
-    /// A `--set` is not of the form `loader.field=value`.
-    #[error("unusable --set: expected loader.field=value, got {got:?}")]
-    Set {
-        /// What was given.
-        got: String,
-    },
+    /// A `--set` does not fit.
+    #[error(transparent)]
+    Override(#[from] OverrideError),
     /// A number is out of range.
     #[error("unusable [loader] {field}: expected {expected}, got {got}")]
     Range {
@@ -156,13 +152,11 @@ impl LoaderConfig {
     pub fn from_pipeline(text: &str, settings: &[String]) -> Result<LoaderConfig, ConfigError> {
         let syntax = |error: toml::de::Error| ConfigError::Syntax { reason: error.to_string() };
         let mut pipeline: toml::Table = toml::from_str(text).map_err(syntax)?;
-        for name in pipeline.keys() {
-            if !SECTIONS.contains(&name.as_str()) {
-                return Err(ConfigError::Section { name: name.clone() });
-            }
+        if let Some(name) = unknown_section(&pipeline) {
+            return Err(ConfigError::Section { name: name.to_owned() });
         }
         for setting in settings {
-            apply(&mut pipeline, setting)?;
+            Override::of_pipeline(setting)?.apply(&mut pipeline)?;
         }
         let section = pipeline.remove("loader").unwrap_or_else(|| toml::Value::Table(toml::Table::new()));
         let config: LoaderConfig = section.try_into().map_err(syntax)?;
@@ -241,27 +235,4 @@ impl LoaderConfig {
         }
         toml::to_string(&Pipeline { loader: self }).expect("numbers, texts and lists of them are TOML")
     }
-}
-
-/// Applies `a.b.c=value`; the value is TOML, or else a text.
-fn apply(pipeline: &mut toml::Table, setting: &str) -> Result<(), ConfigError> {
-    let wrong = || ConfigError::Set { got: setting.to_owned() };
-    let (path, value) = setting.split_once('=').ok_or_else(wrong)?;
-    let mut keys: Vec<&str> = path.trim().split('.').collect();
-    let last = keys.pop().filter(|key| !key.is_empty()).ok_or_else(wrong)?;
-    if keys.first().is_none_or(|section| !SECTIONS.contains(section)) {
-        return Err(wrong());
-    }
-    let mut table = pipeline;
-    for key in keys {
-        let entry = table.entry(key).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-        table = entry.as_table_mut().ok_or_else(wrong)?;
-    }
-    let parsed = toml::from_str::<toml::Table>(&format!("value = {value}"));
-    let value = match parsed.map(|mut table| table.remove("value")) {
-        Ok(Some(value)) => value,
-        _ => toml::Value::String(value.trim().to_owned()),
-    };
-    table.insert(last.to_owned(), value);
-    Ok(())
 }

@@ -2,8 +2,8 @@
 //!
 //! `cargo run --release -p gawm-model --example bench_step -- MODE [PRESET] [CLIPS] [REPEATS]`, where MODE is `step`,
 //! `encode` or `plan` (where CLIPS is the number of iterations); `bench_peer.py` prints the same lines for PyTorch. `RAYON_NUM_THREADS` sets the threads.
-//! With `--profile` a further repeat is counted by the kernels: seconds of all threads and GFLOP/s per kind.
-//! A line has the smallest wall time and the smallest user CPU time of a repeat, after one repeat that is not counted.
+//! `--bf16` rounds operands of products (step and encode). With `--profile` a further repeat is counted by the kernels: seconds of all threads and GFLOP/s per kind.
+//! A line has the smallest wall time and the smallest CPU time (user and system, all threads) of a repeat, after one repeat that is not counted.
 
 use std::time::Instant;
 
@@ -12,8 +12,8 @@ use gawm_kernels::profile;
 use gawm_model::objective::StateRule;
 use gawm_model::plan::{CemConfig, SeededNoise, Start, plan_to_goal};
 use gawm_model::{
-    AdamW, AdamWConfig, Clips, DataWidths, Device, Gradients, ModelConfig, Objectives, Pass, Stream, Tensor,
-    WorldModel, losses,
+    AdamW, AdamWConfig, Clips, DataWidths, Device, Gradients, ModelConfig, Objectives, Pass, Precision,
+    Stream, Tensor, WorldModel, losses,
 };
 
 const WIDTHS: DataWidths = DataWidths { action: 10, state: 6 };
@@ -21,7 +21,11 @@ const WIDTHS: DataWidths = DataWidths { action: 10, state: 6 };
 fn main() -> anyhow::Result<()> {
     let mut arguments: Vec<String> = std::env::args().skip(1).collect();
     let profiled = arguments.iter().any(|argument| argument == "--profile");
-    arguments.retain(|argument| argument != "--profile");
+    let precision = match arguments.iter().any(|argument| argument == "--bf16") {
+        true => Precision::Bf16,
+        false => Precision::F32,
+    };
+    arguments.retain(|argument| argument != "--profile" && argument != "--bf16");
     let argument = |index: usize| arguments.get(index).map(String::as_str);
     let mode = argument(0).context("expected step, encode or plan")?;
     let preset = argument(1).unwrap_or("tiny-14");
@@ -41,7 +45,7 @@ fn main() -> anyhow::Result<()> {
             let clips = Clips::try_new(frames, actions, states, None, &StateRule::default())?;
             let mut optimizer = AdamW::new(AdamWConfig::default());
             measure(repeats, profiled, || {
-                let pass = Pass::train(9, optimizer.step_count());
+                let pass = Pass { precision, ..Pass::train(9, optimizer.step_count()) };
                 let losses = losses(&model, &clips, &Objectives::default(), &pass)?;
                 let gradients = Gradients::of(&losses.total, model.parameters())?;
                 optimizer.step(model.parameters(), &gradients, 5e-5)?;
@@ -49,16 +53,16 @@ fn main() -> anyhow::Result<()> {
             })?
         }
         "encode" => measure(repeats, profiled, || {
-            model.encode(&frames, &Pass::eval())?.detach();
+            model.encode(&frames, &Pass { precision, ..Pass::eval() })?.detach();
             Ok(())
         })?,
         "plan" => measure(repeats, profiled, || plan(&model, size, clips))?,
         other => bail!("unknown mode {other:?}: expected step, encode or plan"),
     };
     println!(
-        "{{\"who\": \"gawm\", \"mode\": \"{mode}\", \"preset\": \"{preset}\", \"clips\": {clips}, \"wall_s\": {:.4}, \"user_s\": {:.4}, \"peak_mib\": {}}}",
+        "{{\"who\": \"gawm\", \"mode\": \"{mode}\", \"preset\": \"{preset}\", \"clips\": {clips}, \"wall_s\": {:.4}, \"cpu_s\": {:.4}, \"peak_mib\": {}}}",
         best.wall_secs,
-        best.user_secs,
+        best.cpu_secs,
         peak_mib()?
     );
     Ok(())
@@ -81,7 +85,7 @@ fn normal(name: &str, shape: &[usize]) -> anyhow::Result<Tensor> {
 
 struct Best {
     wall_secs: f64,
-    user_secs: f64,
+    cpu_secs: f64,
 }
 
 fn measure(
@@ -90,12 +94,12 @@ fn measure(
     mut work: impl FnMut() -> anyhow::Result<()>,
 ) -> anyhow::Result<Best> {
     work()?;
-    let mut best = Best { wall_secs: f64::INFINITY, user_secs: f64::INFINITY };
+    let mut best = Best { wall_secs: f64::INFINITY, cpu_secs: f64::INFINITY };
     for _ in 0..repeats {
-        let (user, wall) = (user_secs()?, Instant::now());
+        let (cpu, wall) = (cpu_secs()?, Instant::now());
         work()?;
         best.wall_secs = best.wall_secs.min(wall.elapsed().as_secs_f64());
-        best.user_secs = best.user_secs.min(user_secs()? - user);
+        best.cpu_secs = best.cpu_secs.min(cpu_secs()? - cpu);
     }
     if profiled {
         print_profile(&mut work)?;
@@ -105,11 +109,11 @@ fn measure(
 
 /// Prints what the kernels counted in one repeat, and what that repeat took besides.
 fn print_profile(work: &mut impl FnMut() -> anyhow::Result<()>) -> anyhow::Result<()> {
-    let user = user_secs()?;
+    let cpu = cpu_secs()?;
     profile::start();
     work()?;
     let shares = profile::stop();
-    let total = user_secs()? - user;
+    let total = cpu_secs()? - cpu;
     for share in &shares {
         let rate = if share.secs > 0.0 { share.gflop / share.secs } else { 0.0 };
         let kind = format!("{:?}", share.kind);
@@ -124,12 +128,17 @@ fn print_profile(work: &mut impl FnMut() -> anyhow::Result<()>) -> anyhow::Resul
     Ok(())
 }
 
-/// User CPU time of this process; Linux counts it in hundredths of a second.
-fn user_secs() -> anyhow::Result<f64> {
-    let stat = std::fs::read_to_string("/proc/self/stat")?;
-    let (_, fields) = stat.rsplit_once(')').context("/proc/self/stat: expected a closing bracket")?;
-    let ticks = fields.split_whitespace().nth(11).context("/proc/self/stat: expected utime")?;
-    Ok(ticks.parse::<f64>()? / 100.0)
+/// CPU time of all threads of this process, user and system.
+fn cpu_secs() -> anyhow::Result<f64> {
+    let mut nanoseconds = 0u64;
+    for task in std::fs::read_dir("/proc/self/task")? {
+        let path = task?.path().join("schedstat");
+        let text = std::fs::read_to_string(&path)?;
+        let first =
+            text.split_whitespace().next().with_context(|| format!("{}: is empty", path.display()))?;
+        nanoseconds += first.parse::<u64>()?;
+    }
+    Ok(nanoseconds as f64 * 1e-9)
 }
 
 /// Largest resident memory of this process so far.

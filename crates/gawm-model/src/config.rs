@@ -1,5 +1,6 @@
 //! Sizes of a model: what a user writes ([`ModelConfig`]) and what is checked ([`Architecture`]).
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -10,7 +11,7 @@ use thiserror::Error;
 pub const PRESETS: [&str; 3] = ["tiny-14", "nano", "micro"];
 
 /// Sizes of a model as written in a configuration; the default is `tiny-14`, the published model.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ModelConfig {
     /// Side of the frames in pixels that the position table is made for; other sizes are interpolated.
@@ -41,7 +42,7 @@ pub struct ModelConfig {
 }
 
 /// Sizes of the vision transformer.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct EncoderConfig {
     /// Side of a patch in pixels.
@@ -57,7 +58,7 @@ pub struct EncoderConfig {
 }
 
 /// Sizes of the predictor; its tokens have the width of a latent.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PredictorConfig {
     /// Number of frames it sees at once; a clip has one more.
@@ -75,7 +76,7 @@ pub struct PredictorConfig {
 }
 
 /// What the inverse dynamics head sees of two consecutive latents.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum InverseInput {
     /// `concat(z[t], z[t+1])`, as published.

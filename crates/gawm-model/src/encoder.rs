@@ -2,7 +2,7 @@
 
 use candle_core::{IndexOp, Tensor};
 use gawm_kernels::VitEncoder;
-use gawm_kernels::vit::VitShape;
+use gawm_kernels::vit::{Products, VitShape};
 
 use crate::Result;
 use crate::config::Architecture;
@@ -150,9 +150,13 @@ impl Vit {
     ///
     /// By fused operations where they take the input, else the first of [`Vit::tokens`].
     pub fn class_tokens(&self, images: &Tensor, pass: &Pass) -> Result<Tensor> {
-        if pass.precision != Precision::F32 || !VitEncoder::takes(images) {
+        let products = match pass.precision {
+            Precision::F32 => Some(Products::Single),
+            Precision::Bf16 => gawm_kernels::pairs::available().then_some(Products::Pairs),
+        };
+        let Some(products) = products.filter(|_| VitEncoder::takes(images)) else {
             return self.tokens(images, pass)?.i((.., 0)); // [N, W']
-        }
+        };
         let (rows, columns) = self.grid(images)?;
         let layer = self.layers.first();
         let shape = VitShape {
@@ -165,6 +169,7 @@ impl Vit {
             heads: layer.map_or(1, |layer| layer.heads),
             mlp_width: layer.map_or(Ok(1), |layer| layer.fc1.outputs())?,
             epsilon: Vit::EPSILON as f32,
+            products,
         };
         self.fused.forward(images, &self.positions(rows, columns)?, shape, pass.training)
     }

@@ -1,22 +1,28 @@
 //! The heads of training: G reads the physical state from latents, H the action between them.
 
 use candle_core::{D, Tensor};
+use gawm_kernels::head::{Head as FusedHead, HeadNorm};
 
 use crate::Result;
 use crate::config::{Architecture, InverseInput};
 use crate::layers::{LayerNorm, Linear, gelu};
 use crate::parameters::{Parameters, Specs};
 use crate::pass::Pass;
+use crate::projector::fused_head;
 
 /// `Linear -> LayerNorm -> GELU -> Linear`.
 #[derive(Debug, Clone)]
 struct Head {
+    /// All of it in one operation, for training; the rest is the composed form of the same.
+    fused: FusedHead,
     expand: Linear,
     norm: LayerNorm,
     contract: Linear,
 }
 
 impl Head {
+    const EPSILON: f64 = 1e-5;
+
     fn specs(specs: &mut Specs, name: &str, inputs: usize, hidden: usize, outputs: usize) {
         Linear::specs(specs, &format!("{name}.net.0"), inputs, hidden);
         LayerNorm::specs(specs, &format!("{name}.net.1"), hidden);
@@ -25,13 +31,28 @@ impl Head {
 
     fn load(parameters: &Parameters, name: &str) -> Result<Head> {
         Ok(Head {
+            fused: fused_head(parameters, name, HeadNorm::Layer, Head::EPSILON)?,
             expand: Linear::load(parameters, &format!("{name}.net.0"))?,
-            norm: LayerNorm::load(parameters, &format!("{name}.net.1"), 1e-5)?,
+            norm: LayerNorm::load(parameters, &format!("{name}.net.1"), Head::EPSILON)?,
             contract: Linear::load(parameters, &format!("{name}.net.3"))?,
         })
     }
 
+    /// Maps [.., inputs] to [.., outputs].
     fn forward(&self, x: &Tensor, pass: &Pass) -> Result<Tensor> {
+        if pass.trains_fused(x) && self.fused.takes(x) {
+            let mut dims = x.dims().to_vec();
+            let (y, _) = self.fused.forward(&x.flatten_to(D::Minus2)?)?;
+            if let Some(last) = dims.last_mut() {
+                *last = y.dim(1)?;
+            }
+            return y.reshape(dims); // [.., outputs]
+        }
+        self.forward_composed(x, pass)
+    }
+
+    /// [`Head::forward`] in composed operations.
+    fn forward_composed(&self, x: &Tensor, pass: &Pass) -> Result<Tensor> {
         let x = self.norm.forward(&self.expand.forward(x, pass)?)?;
         self.contract.forward(&gelu(&x)?, pass)
     }
@@ -92,5 +113,30 @@ impl InverseDynamics {
             InverseInput::Difference => (to - from)?,
         };
         self.head.forward(&input, pass) // [B, T-1, A]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::Device;
+
+    use super::*;
+    use crate::random::Stream;
+
+    #[test]
+    fn fused_and_composed_heads_agree() {
+        let mut specs = Specs::new();
+        Head::specs(&mut specs, "h", 6, 20, 3);
+        let head = Head::load(&Parameters::init(&specs, 2, &Device::Cpu).unwrap(), "h").unwrap();
+        for shape in [[1, 1, 6], [2, 3, 6], [300, 3, 6]] {
+            let x = Stream::new(1, "x", 0).normals(shape.iter().product());
+            let x = Tensor::from_vec(x, &shape, &Device::Cpu).unwrap();
+            let fused = head.forward(&x, &Pass::train(0, 0)).unwrap();
+            let composed = head.forward_composed(&x, &Pass::train(0, 0)).unwrap();
+            assert_eq!(fused.dims(), [shape[0], shape[1], 3]);
+            let worst =
+                (fused - composed).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+            assert!(worst < 1e-5, "{shape:?}: {worst}");
+        }
     }
 }

@@ -237,7 +237,7 @@ impl BatchNorm {
     }
 
     /// Moves the running statistics towards those of a batch of `rows` rows. Shapes [W].
-    fn track(&self, mean: &Tensor, biased_variance: &Tensor, rows: usize) -> Result<()> {
+    pub(crate) fn track(&self, mean: &Tensor, biased_variance: &Tensor, rows: usize) -> Result<()> {
         let unbiased = (biased_variance * (rows as f64 / (rows as f64 - 1.0)))?;
         for (variable, new) in [(&self.running_mean, mean), (&self.running_var, &unbiased)] {
             let old = (variable.as_detached_tensor() * (1.0 - BatchNorm::MOMENTUM))?;

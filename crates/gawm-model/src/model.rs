@@ -10,7 +10,7 @@ use crate::encoder::{Encoder, Vit};
 use crate::heads::{InverseDynamics, StateProbe};
 use crate::parameters::{Parameters, Specs};
 use crate::pass::Pass;
-use crate::predictor::Predictor;
+use crate::predictor::{BLOCK_PARTS, Predictor};
 use crate::projector::Projector;
 
 /// A world model: an encoder of frames, an embedder of actions, a predictor of latents, heads for training.
@@ -190,23 +190,6 @@ const EMBEDDER_PARTS: [&str; 6] = [
     "embed.0.bias",
     "embed.2.weight",
     "embed.2.bias",
-];
-
-/// Tensors of a block, in the order of [`RolloutTensors`].
-const BLOCK_PARTS: [&str; 13] = [
-    "adaLN_modulation.1.weight",
-    "adaLN_modulation.1.bias",
-    "attn.norm.weight",
-    "attn.norm.bias",
-    "attn.to_qkv.weight",
-    "attn.to_out.0.weight",
-    "attn.to_out.0.bias",
-    "mlp.net.0.weight",
-    "mlp.net.0.bias",
-    "mlp.net.1.weight",
-    "mlp.net.1.bias",
-    "mlp.net.4.weight",
-    "mlp.net.4.bias",
 ];
 
 /// Tensors of the projector, in the order of [`RolloutTensors`].

@@ -25,6 +25,9 @@ pub enum Precision {
     #[default]
     F32,
     /// Operands rounded to bf16, results widened to f32; parameters, statistics, norms, softmax and losses stay f32.
+    ///
+    /// In training on a CPU only the encoder's linear layers are worth rounding: its attention, the predictor and the heads
+    /// keep f32 operands there.
     Bf16,
 }
 
@@ -59,14 +62,28 @@ impl Pass {
     /// The mask is a function of seed, step, `site` and the position of the element (row-major): word n of the stream
     /// decides element n, so it does not depend on threads, devices or what else ran.
     pub fn dropout(&self, x: &Tensor, rate: f64, site: &str) -> Result<Tensor> {
-        if !self.training || rate == 0.0 {
+        if !self.drops(rate) {
             return Ok(x.clone());
         }
+        x * Tensor::from_vec(self.dropout_mask(x.elem_count(), rate, site), x.shape(), x.device())?
+    }
+
+    /// Whether fused operations in f32 may compute a training pass over `x`: they are for CPUs, where they are faster than
+    /// composed ones in any precision.
+    pub(crate) fn trains_fused(&self, x: &Tensor) -> bool {
+        self.training && x.device().is_cpu()
+    }
+
+    /// Whether [`Pass::dropout`] does anything.
+    pub(crate) fn drops(&self, rate: f64) -> bool {
+        self.training && rate != 0.0
+    }
+
+    /// The factors of [`Pass::dropout`] for `count` elements: 0 or 1 / (1 - rate).
+    pub(crate) fn dropout_mask(&self, count: usize, rate: f64, site: &str) -> Vec<f32> {
         let threshold = (rate * 4_294_967_296.0) as u32;
         let scale = (1.0 / (1.0 - rate)) as f32;
         let mut stream = self.stream(&format!("dropout/{site}"));
-        let mask: Vec<f32> =
-            (0..x.elem_count()).map(|_| if stream.next_u32() < threshold { 0.0 } else { scale }).collect();
-        x * Tensor::from_vec(mask, x.shape(), x.device())?
+        (0..count).map(|_| if stream.next_u32() < threshold { 0.0 } else { scale }).collect()
     }
 }

@@ -1,6 +1,7 @@
 //! The predictor: a causal transformer whose blocks are modulated by the actions (AdaLN-zero).
 
 use candle_core::{D, Tensor};
+use gawm_kernels::predictor::{BlockMasks, Predictor as FusedPredictor, PredictorShape};
 
 use crate::Result;
 use crate::config::Architecture;
@@ -22,6 +23,9 @@ use crate::pass::Pass;
 /// twice, as published.
 #[derive(Debug, Clone)]
 pub struct Predictor {
+    /// All of it in one operation, for training; the rest is the composed form of the same.
+    fused: FusedPredictor,
+    head_width: usize,
     pos_embedding: Tensor,
     blocks: Vec<Block>,
     norm: LayerNorm,
@@ -88,16 +92,61 @@ impl Predictor {
             })
         };
         Ok(Predictor {
+            fused: Predictor::fuse(parameters, config.depth)?,
+            head_width: config.head_width,
             pos_embedding: parameters.get("predictor.pos_embedding")?,
             blocks: (0..config.depth).map(block).collect::<Result<_>>()?,
             norm: LayerNorm::load(parameters, "predictor.transformer.norm", AFFINE_EPSILON)?,
         })
     }
 
+    /// Hands the parameters to the fused predictor, in the order of [`gawm_kernels::predictor`].
+    fn fuse(parameters: &Parameters, depth: usize) -> Result<FusedPredictor> {
+        let mut names = vec!["predictor.pos_embedding".to_owned()];
+        names.extend(["weight", "bias"].map(|which| format!("predictor.transformer.norm.{which}")));
+        for block in 0..depth {
+            names.extend(BLOCK_PARTS.map(|part| format!("predictor.transformer.layers.{block}.{part}")));
+        }
+        let tensors = names.iter().map(|name| parameters.get(name)).collect::<Result<_>>()?;
+        Ok(FusedPredictor::new(tensors, parameters.sink().clone()))
+    }
+
+    /// [`Predictor::forward`] in training by one fused operation.
+    fn forward_fused(&self, z: &Tensor, c: &Tensor, pass: &Pass) -> Result<Tensor> {
+        let (clips, frames, latent) = z.dims3()?;
+        let (heads, mlp_width) = match self.blocks.first() {
+            Some(block) => (block.heads, block.expand.outputs()?),
+            None => candle_core::bail!("predictor: expected at least one block"),
+        };
+        let shape = PredictorShape {
+            clips,
+            frames,
+            latent,
+            heads,
+            head_width: self.head_width,
+            mlp_width,
+            plain_epsilon: PLAIN_EPSILON as f32,
+            affine_epsilon: AFFINE_EPSILON as f32,
+        };
+        let dropping = self.blocks.iter().filter(|block| pass.drops(block.dropout));
+        let masks = dropping.map(|block| block.masks(&shape, pass)).collect();
+        self.fused.forward(z, c, shape, masks)
+    }
+
     /// Maps latents and action embeddings, both [B, T, D] with T up to the history, to [B, T, D].
     ///
     /// Output k sees latents and actions 0..=k only and stands for frame k + 1 (before `pred_proj`).
     pub fn forward(&self, z: &Tensor, c: &Tensor, pass: &Pass) -> Result<Tensor> {
+        let (_, t, _) = z.dims3()?;
+        let fits = t <= self.pos_embedding.dim(1)? && !self.blocks.is_empty() && c.dims() == z.dims();
+        if pass.trains_fused(z) && fits && self.fused.takes(z, c) {
+            return self.forward_fused(z, c, pass);
+        }
+        self.forward_composed(z, c, pass)
+    }
+
+    /// [`Predictor::forward`] in composed operations.
+    fn forward_composed(&self, z: &Tensor, c: &Tensor, pass: &Pass) -> Result<Tensor> {
         let (_, t, _) = z.dims3()?;
         let mask = causal_mask(t, z.device())?;
         let modulation = silu(c)?;
@@ -109,7 +158,38 @@ impl Predictor {
     }
 }
 
+/// Tensors of a block, in the order of [`gawm_kernels::predictor`] and [`gawm_kernels::rollout`].
+pub(crate) const BLOCK_PARTS: [&str; 13] = [
+    "adaLN_modulation.1.weight",
+    "adaLN_modulation.1.bias",
+    "attn.norm.weight",
+    "attn.norm.bias",
+    "attn.to_qkv.weight",
+    "attn.to_out.0.weight",
+    "attn.to_out.0.bias",
+    "mlp.net.0.weight",
+    "mlp.net.0.bias",
+    "mlp.net.1.weight",
+    "mlp.net.1.bias",
+    "mlp.net.4.weight",
+    "mlp.net.4.bias",
+];
+
 impl Block {
+    /// The dropout masks of a pass, the same that [`Block::forward`] draws.
+    fn masks(&self, shape: &PredictorShape, pass: &Pass) -> BlockMasks {
+        let rows = shape.clips * shape.frames;
+        let mask = |columns: usize, site: &str| {
+            pass.dropout_mask(rows * columns, self.dropout, &format!("{}.{site}", self.site))
+        };
+        BlockMasks {
+            probabilities: mask(shape.heads * shape.frames, "probabilities"),
+            attention: mask(shape.latent, "attention"),
+            hidden: mask(shape.mlp_width, "hidden"),
+            mlp: mask(shape.latent, "mlp"),
+        }
+    }
+
     /// One block; `x` and `modulation` (SiLU of the action embedding) have shape [B, T, D], kept.
     fn forward(&self, x: &Tensor, modulation: &Tensor, mask: &Tensor, pass: &Pass) -> Result<Tensor> {
         let parts = self.modulation.forward(modulation, pass)?.chunk(6, D::Minus1)?; // 6 x [B, T, D]
@@ -145,4 +225,54 @@ impl Block {
 /// `LN0(x) * (1 + scale) + shift`. Shapes [B, T, D].
 fn modulate(x: &Tensor, shift: &Tensor, scale: &Tensor) -> Result<Tensor> {
     (normalize(x, PLAIN_EPSILON)? * (scale + 1.0)?)? + shift
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::Device;
+
+    use super::*;
+    use crate::config::{DataWidths, ModelConfig};
+    use crate::model::WorldModel;
+    use crate::random::Stream;
+
+    /// Largest difference between the fused and the composed form, and between training without dropout and evaluation.
+    fn check(clips: usize, frames: usize, change: impl FnOnce(&mut ModelConfig), dropout: f64) {
+        let mut config = ModelConfig::preset("micro").unwrap();
+        change(&mut config);
+        config.predictor.dropout = dropout;
+        let architecture = config.resolve(DataWidths { action: 4, state: 3 }).unwrap();
+        let normal = |name: &str, dims: &[usize]| {
+            let values = Stream::new(1, name, 0).normals(dims.iter().product());
+            Tensor::from_vec(values, dims, &Device::Cpu).unwrap()
+        };
+        let model = WorldModel::new(architecture, 1, &Device::Cpu).unwrap();
+        for (name, tensor) in model.parameters().iter().filter(|(name, _)| name.contains("adaLN")) {
+            model.parameters().set(name, &(normal(name, tensor.dims()) * 0.3).unwrap()).unwrap();
+        }
+        let predictor = Predictor::load(model.parameters(), model.architecture()).unwrap();
+        let latent = model.architecture().config().latent_width;
+        let (z, c) = (normal("z", &[clips, frames, latent]), normal("c", &[clips, frames, latent]));
+        let difference = |a: &Tensor, b: &Tensor| {
+            (a - b).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap()
+        };
+        let pass = Pass::train(3, 5);
+        let fused = predictor.forward(&z, &c, &pass).unwrap();
+        let composed = predictor.forward_composed(&z, &c, &pass).unwrap();
+        assert!(difference(&fused, &composed) < 2e-5, "{clips} x {frames} at rate {dropout}");
+        let evaluated = predictor.forward(&z, &c, &Pass::eval()).unwrap();
+        assert_eq!(difference(&fused, &evaluated) < 2e-5, dropout == 0.0, "{clips} x {frames}");
+    }
+
+    #[test]
+    fn fused_and_composed_predictors_draw_the_same_dropout() {
+        for dropout in [0.0, 0.3] {
+            check(1, 1, |_| {}, dropout);
+            check(2, 3, |_| {}, dropout);
+            check(40, 2, |_| {}, dropout);
+            // Widths that fill no vector, and a single head.
+            check(2, 3, |config| (config.predictor.heads, config.predictor.head_width) = (3, 5), dropout);
+            check(3, 2, |config| (config.predictor.heads, config.predictor.mlp_width) = (1, 7), dropout);
+        }
+    }
 }

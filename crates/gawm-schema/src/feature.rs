@@ -1,11 +1,12 @@
 //! Features of a dataset and their dimensions.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::{Kind, Unit};
 
 /// Everything that is fixed for all episodes of a dataset.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Schema {
     /// Kind of robot, if known.
     pub robot_type: Option<String>,
@@ -18,7 +19,7 @@ pub struct Schema {
 }
 
 /// One recorded stream, as far as rows need to know it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct StreamInfo {
     /// Unique name.
     pub name: String,
@@ -30,7 +31,7 @@ pub struct StreamInfo {
 }
 
 /// One column of the dataset that carries robot data.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Feature {
     /// Column name, such as `observation.state`, `action` or `observation.images.wrist`.
     pub name: String,
@@ -41,7 +42,7 @@ pub struct Feature {
 }
 
 /// What a feature is for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
 pub enum Role {
@@ -58,7 +59,7 @@ pub enum Role {
 }
 
 /// What a feature holds.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "type", rename_all = "kebab-case")]
 pub enum FeatureData {
     /// A vector of numbers; its width is the number of dims in all parts.
@@ -73,7 +74,7 @@ pub enum FeatureData {
 }
 
 /// How the values of a vector feature are stored.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum FloatType {
     /// 32-bit, the default of LeRobot.
@@ -84,7 +85,7 @@ pub enum FloatType {
 }
 
 /// The size of a camera's images in the dataset.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ImageSpec {
     /// Rows of pixels.
     pub height: u32,
@@ -98,7 +99,7 @@ pub struct ImageSpec {
 }
 
 /// A run of dims that share a kind.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Part {
     /// What the numbers are geometrically.
     #[serde(flatten)]
@@ -111,7 +112,7 @@ pub struct Part {
 }
 
 /// One dimension of a vector feature.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Dim {
     /// Name, unique within its feature.
     pub name: String,

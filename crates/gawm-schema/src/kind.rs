@@ -1,9 +1,10 @@
 //! Kinds of values and their units: what a number means geometrically.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The kind of a [`Part`](crate::Part): what its numbers are geometrically, hence how they are encoded continuously.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 #[non_exhaustive]
 pub enum Kind {
@@ -37,7 +38,7 @@ pub enum Kind {
 }
 
 /// The interval that recorded angles are wrapped to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Wrap {
     /// Not wrapped: the angle counts turns, or the joint has limits.
@@ -49,7 +50,7 @@ pub enum Wrap {
 }
 
 /// The order of a quaternion's components in the source.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum QuaternionOrder {
     /// x, y, z, w (ROS, SciPy).
@@ -59,7 +60,7 @@ pub enum QuaternionOrder {
 }
 
 /// Axes of three Euler angles; lower case is extrinsic (fixed axes), upper case intrinsic (moving axes), as in SciPy.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[non_exhaustive]
 pub enum EulerSequence {
     /// Extrinsic x, y, z: roll, pitch, yaw about fixed axes (URDF, ROS).
@@ -77,7 +78,7 @@ pub enum EulerSequence {
 }
 
 /// The unit of a value in the dataset, after conversion to SI.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(transparent)]
 pub struct Unit(pub String);
 

@@ -12,6 +12,7 @@ mod encoding;
 mod feature;
 mod hash;
 mod kind;
+pub mod pipeline;
 pub mod rotation;
 mod standardise;
 mod statistics;

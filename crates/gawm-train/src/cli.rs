@@ -13,8 +13,9 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::{Args, CommandFactory, Parser, Subcommand};
+use gawm_schema::pipeline::Override;
 
-use crate::config::Override;
+use crate::config::ConfigError;
 use crate::loaders::LoaderProgram;
 use crate::output::Talk;
 use failure::Failure;
@@ -114,7 +115,9 @@ impl Common {
     }
 
     fn overrides(&self) -> Result<Vec<Override>, Failure> {
-        self.set.iter().map(|text| text.parse().map_err(Failure::from)).collect()
+        let read =
+            |text: &String| Override::of_pipeline(text).map_err(|error| ConfigError::from(error).into());
+        self.set.iter().map(read).collect()
     }
 
     /// Limits the threads of this process.

@@ -1,6 +1,5 @@
 //! What a pipeline file says to the trainer: `[model]`, `[objectives]`, `[train]`, and how many loaders `[loader]` asks for.
 
-mod overrides;
 mod resolved;
 #[cfg(test)]
 mod tests;
@@ -9,13 +8,10 @@ use std::path::{Path, PathBuf};
 
 use gawm_model::objective::ObjectiveError;
 use gawm_model::{AdamWConfig, Decay, Device, ModelConfig, Objectives, Precision, WarmupCosine};
+use gawm_schema::pipeline::{Override, OverrideError};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
-
-pub use overrides::Override;
-
-/// Names of the sections that a pipeline file may have; each program reads its own.
-pub const SECTIONS: [&str; 7] = ["sim", "ingest", "loader", "model", "objectives", "train", "eval"];
 
 /// Everything that a run is told, resolved and checked.
 #[derive(Debug, Clone)]
@@ -33,7 +29,7 @@ pub struct Config {
 }
 
 /// The section `[train]`; the default is the published setting where there is one.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainConfig {
     /// Optimiser steps in all. Default 1000.
@@ -78,7 +74,7 @@ pub struct TrainConfig {
 }
 
 /// Precision as a user asks for it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum PrecisionChoice {
     /// What the device is good at.
@@ -126,14 +122,9 @@ pub enum ConfigError {
         /// Every refused value.
         values: Vec<RefusedValue>,
     },
-    /// An override is no `key=value`.
-    #[error("--set {text:?}: {message}")]
-    Override {
-        /// As given.
-        text: String,
-        /// What is wrong.
-        message: String,
-    },
+    /// An override does not fit.
+    #[error(transparent)]
+    Override(#[from] OverrideError),
     /// The device does not exist or the program was not built for it.
     #[error("train.device: expected a device of this machine, got {got:?} ({cause})")]
     Device {

@@ -137,6 +137,9 @@ impl Loaders {
             restarts: vec![0; count],
         };
         for loader in 0..loaders.options.loaders {
+            if loaders.interrupt.is_set() {
+                return Err(LoaderError::Interrupted);
+            }
             loaders.launch(loader, start)?;
         }
         for loader in 0..loaders.options.loaders {

@@ -103,16 +103,15 @@ pub enum RunFolderError {
 }
 
 impl RunFolder {
-    /// Makes the folder of a new run.
+    /// Makes the folder of a new run. A folder in which a start failed before its first step is new.
     ///
     /// # Errors
     ///
     /// - [`RunFolderError::Exists`], [`RunFolderError::InUse`], [`RunFolderError::Io`].
     pub fn create(path: &Path, config: &Config) -> Result<RunFolder, RunFolderError> {
         fs::create_dir_all(path).map_err(io("make", path))?;
-        let is_lock = |entry: &fs::DirEntry| entry.file_name() == "lock";
         let mut entries = path.read_dir().map_err(io("list", path))?.filter_map(Result::ok);
-        if entries.any(|entry| !is_lock(&entry)) {
+        if !entries.all(|entry| is_of_no_run(&entry)) {
             return Err(RunFolderError::Exists { path: path.to_owned() });
         }
         let folder = RunFolder::lock(path)?;
@@ -250,6 +249,15 @@ impl RunFolder {
         let mut file = File::create(&temporary).map_err(io("write", &temporary))?;
         file.write_all(bytes).and_then(|()| file.sync_all()).map_err(io("write", &temporary))?;
         fs::rename(&temporary, &path).map_err(io("write", &path))
+    }
+}
+
+/// Whether a start that ended before it saw data leaves this: nothing of a run is lost with it.
+fn is_of_no_run(entry: &fs::DirEntry) -> bool {
+    match entry.file_name().to_str() {
+        Some("lock" | "config.toml" | "config.toml.tmp") => true,
+        Some("checkpoints") => entry.path().read_dir().is_ok_and(|mut files| files.next().is_none()),
+        _ => false,
     }
 }
 

@@ -180,7 +180,7 @@ impl ValidationRecord {
             }
         }
         text.push_str(&format!(
-            "; skill {:.3}, {:.3} without actions; latents std {:.3}, effective rank {:.1}; score {:.4}{}",
+            "; skill {:.3}, {:.3} with shuffled actions; latents std {:.3}, effective rank {:.1}; score {:.4}{}",
             self.skill,
             self.skill_shuffled_actions,
             self.latent_std,

@@ -51,6 +51,12 @@ enum Verb {
     Run(RunArgs),
     /// Make logs, a dataset, a model and plans from nothing, and one page about them
     Quickstart(QuickstartArgs),
+    /// Print the JSON Schema of a file, for editors
+    Schema {
+        /// pipeline, contract or task
+        #[arg(value_parser = clap::builder::PossibleValuesParser::new(crate::schemas::NAMES.map(|(name, _)| name)))]
+        name: String,
+    },
     /// Print a completion script for a shell
     Completions {
         /// The shell
@@ -135,6 +141,11 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
         Verb::Sim(rest) => gawm_sim::cli::main(named("gawm sim", rest)),
         Verb::Run(arguments) => run_pipeline(&arguments),
         Verb::Quickstart(arguments) => run_quickstart(&arguments),
+        Verb::Schema { name } => {
+            let schema = crate::schemas::schema(&name).expect("clap takes known names alone");
+            print(&format!("{schema:#}\n"));
+            ExitCode::SUCCESS
+        }
         Verb::Completions { shell } => {
             clap_complete::generate(shell, &mut Cli::command(), "gawm", &mut std::io::stdout());
             ExitCode::SUCCESS
@@ -160,7 +171,7 @@ fn run_pipeline(arguments: &RunArgs) -> ExitCode {
 fn try_run_pipeline(arguments: &RunArgs) -> Result<ExitCode, RunError> {
     let pipeline = Pipeline::load(&arguments.pipeline, &arguments.set)?;
     if arguments.print_config {
-        print(&pipeline.text_of(&crate::pipeline::SECTIONS));
+        print(&pipeline.text_of(&gawm_schema::pipeline::SECTIONS));
         return Ok(ExitCode::SUCCESS);
     }
     let program = prepare()?;
@@ -193,7 +204,7 @@ fn try_run_quickstart(arguments: &QuickstartArgs) -> Result<ExitCode, Quickstart
         let path = Path::new("quickstart");
         let pipeline =
             Pipeline::parse(path, quickstart::PIPELINE, &arguments.set).map_err(RunError::Pipeline)?;
-        print(&pipeline.text_of(&crate::pipeline::SECTIONS));
+        print(&pipeline.text_of(&gawm_schema::pipeline::SECTIONS));
         return Ok(ExitCode::SUCCESS);
     }
     let program = prepare()?;
@@ -256,8 +267,12 @@ fn advice(error: &RunError) -> (u8, Option<String>) {
             (2, Some("`gawm ingest suggest LOG` writes one from a log".to_owned()))
         }
         RunError::Pipeline(_) => (2, None),
+        RunError::InUse { .. } => {
+            (1, Some("wait until it has ended, or end it: `fuser` names its process".to_owned()))
+        }
         RunError::Foreign { .. } => (2, Some("choose another folder with --out, or move it away".to_owned())),
         RunError::Interrupted { .. } => (130, None),
+        RunError::Step { is_usage: true, .. } => (2, None),
         _ => (1, None),
     }
 }

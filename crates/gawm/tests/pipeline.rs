@@ -74,13 +74,58 @@ fn a_section_is_checked_by_the_program_that_reads_it() {
     let folder = tempfile::tempdir().unwrap();
     let pipeline = write_pipeline(folder.path());
     let out = folder.path().join("out");
-    let arguments =
-        ["run", pipeline.to_str().unwrap(), "--out", out.to_str().unwrap(), "--set", "sim.sede=1"];
-    let output = gawm(&arguments);
+    // Before any step runs: what a later step would refuse costs no training.
+    for (wrong, section) in [
+        ("sim.sede=1", "[sim]"),
+        ("ingest.stream.0.topics=x", "[ingest]"),
+        ("loader.bach=1", "[loader]"),
+        ("train.stpes=1", "train]"),
+        ("model.preset=huge", "train]"),
+        ("eval.plan.smaples=3", "[eval]"),
+    ] {
+        let output =
+            gawm(&["run", pipeline.to_str().unwrap(), "--out", out.to_str().unwrap(), "--set", wrong]);
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{wrong}: {stderr}");
+        let key = wrong.split('=').next().unwrap().rsplit('.').next().unwrap();
+        assert!(stderr.contains(section), "{wrong}: {stderr}");
+        assert!(stderr.contains(key) || wrong.contains("huge"), "{wrong}: {stderr}");
+        assert!(!out.exists(), "{wrong}");
+    }
+}
+
+#[test]
+fn a_folder_in_which_something_works_is_not_touched() {
+    let folder = tempfile::tempdir().unwrap();
+    let pipeline = write_pipeline(folder.path());
+    let out = folder.path().join("out");
+    std::fs::create_dir_all(&out).unwrap();
+    let lock = std::fs::File::create(out.join("pipeline.lock")).unwrap();
+    rustix::fs::flock(&lock, rustix::fs::FlockOperation::LockExclusive).unwrap();
+    let output = gawm(&["run", pipeline.to_str().unwrap(), "--out", out.to_str().unwrap()]);
     let stderr = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(1), "{stderr}");
-    assert!(stderr.contains("sede") && stderr.contains("step collect"), "{stderr}");
-    assert!(!out.join("dataset").exists());
+    assert!(stderr.contains("still works in this folder"), "{stderr}");
+    drop(lock);
+    check_run(&pipeline, &out, &["--until", "collect"]);
+}
+
+#[test]
+fn what_a_contract_names_lies_beside_the_pipeline() {
+    let folder = tempfile::tempdir().unwrap();
+    let pipeline = write_pipeline(folder.path());
+    let labels = folder.path().join("labels.csv");
+    std::fs::write(&labels, "log,operator\n").unwrap();
+    let out = folder.path().join("out");
+    let named = ["--set", "ingest.labels.side_file=labels.csv", "--until", "ingest"];
+    check_run(&pipeline, &out, &named);
+    let text = std::fs::read_to_string(out.join("pipeline.toml")).unwrap();
+    assert!(text.contains(labels.to_str().unwrap()), "{text}");
+    let again = check_run(&pipeline, &out, &named);
+    assert_eq!(again.matches("up to date").count(), 2, "{again}");
+    std::fs::write(&labels, "log,operator\ntwo-room-000000.mcap,ada\n").unwrap();
+    let changed = check_run(&pipeline, &out, &named);
+    assert_eq!(changed.matches("up to date").count(), 1, "{changed}");
 }
 
 #[test]
@@ -91,7 +136,7 @@ fn a_step_that_fails_ends_the_pipeline_and_can_be_repeated() {
     let arguments = ["run", pipeline.to_str().unwrap(), "--out", out.to_str().unwrap()];
     let broken = gawm(&[&arguments[..], &["--set", "ingest.ticks.stream=nowhere"]].concat());
     let stderr = String::from_utf8(broken.stderr).unwrap();
-    assert_eq!(broken.status.code(), Some(1), "{stderr}");
+    assert_eq!(broken.status.code(), Some(2), "{stderr}");
     assert!(stderr.contains("step ingest"), "{stderr}");
     let repaired = check_run(&pipeline, &out, &[]);
     assert!(repaired.contains("collect: a simulator's episodes to logs: up to date"), "{repaired}");

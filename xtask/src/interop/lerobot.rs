@@ -31,7 +31,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         Some(python) => python.clone(),
         None => {
             let requirements = root().join("xtask/interop/lerobot-requirements.txt");
-            python::environment(&folder.join("venv"), &requirements, &[])?
+            let size = "lerobot with PyTorch: about 8 GB, up to 20 minutes";
+            python::environment(&folder.join("venv"), &requirements, &[], size)?
         }
     };
     let mut datasets =

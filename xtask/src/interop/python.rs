@@ -9,14 +9,19 @@ use crate::process::run;
 
 /// Returns the interpreter of an environment with the packages of `requirements`, making it if needed.
 ///
-/// `bare` are packages that come without their dependencies.
-pub(super) fn environment(folder: &Path, requirements: &Path, bare: &[&str]) -> anyhow::Result<PathBuf> {
+/// `bare` are packages that come without their dependencies; `size` says what the packages take.
+pub(super) fn environment(
+    folder: &Path,
+    requirements: &Path,
+    bare: &[&str],
+    size: &str,
+) -> anyhow::Result<PathBuf> {
     let python = folder.join("bin/python");
     let done = folder.join("complete");
     if done.exists() {
         return Ok(python);
     }
-    eprintln!("making a Python environment in {} (PyTorch: some GB, some minutes)", folder.display());
+    eprintln!("making a Python environment in {} ({size})", folder.display());
     run(Command::new("python3").args(["-m", "venv"]).arg(folder))?;
     let pip = |arguments: &mut Command| run(arguments).map(|_| ());
     pip(Command::new(&python).args(["-m", "pip", "install", "--quiet", "-r"]).arg(requirements))?;

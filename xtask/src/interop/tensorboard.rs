@@ -27,6 +27,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
                 &folder.join("venv"),
                 &root().join("xtask/interop/tensorboard-requirements.txt"),
                 &[],
+                "tensorboard without TensorFlow: about 200 MB, a minute",
             )?
         }
     };

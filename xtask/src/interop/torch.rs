@@ -30,7 +30,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         Some(python) => python.clone(),
         None => {
             let bare = ["stable-worldmodel==0.1.1", "stable-pretraining==0.1.6"];
-            python::environment(&folder.join("venv"), &root().join("xtask/interop/requirements.txt"), &bare)?
+            let requirements = root().join("xtask/interop/requirements.txt");
+            let size = "PyTorch and the published model: about 7 GB, up to 20 minutes";
+            python::environment(&folder.join("venv"), &requirements, &bare, size)?
         }
     };
     let script = root().join("xtask/interop/torch_world_model.py");

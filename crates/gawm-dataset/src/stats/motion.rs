@@ -50,7 +50,10 @@ impl MotionStats {
             .map(|w| (w[2] - 2.0 * w[1] + w[0]).abs())
             .filter(|j| j.is_finite())
             .for_each(|j| stats.jerk.update(j));
-        let mean = values.iter().filter(|v| v.is_finite()).sum::<f64>() / values.len().max(1) as f64;
+        let unwrapped = if is_angle { unwrap(values) } else { Vec::new() };
+        let values = if is_angle { &unwrapped } else { values };
+        let n_finite = values.iter().filter(|v| v.is_finite()).count();
+        let mean = values.iter().filter(|v| v.is_finite()).sum::<f64>() / n_finite.max(1) as f64;
         for (k, lag) in LAGS.into_iter().enumerate().filter(|(_, lag)| *lag < values.len()) {
             for (a, b) in values.iter().zip(&values[lag..]) {
                 let (a, b) = (a - mean, b - mean);
@@ -104,6 +107,23 @@ impl MotionStats {
     }
 }
 
+/// Returns an angle as it turned, without the steps of a turn at its wrap; what is not finite stays so.
+fn unwrap(values: &[f64]) -> Vec<f64> {
+    let mut last: Option<(f64, f64)> = None;
+    let continued = values.iter().map(|&value| {
+        if !value.is_finite() {
+            return value;
+        }
+        let here = last.map_or(value, |(before, turned)| {
+            let step = value - before;
+            turned + step - TAU * (step / TAU).round()
+        });
+        last = Some((value, here));
+        here
+    });
+    continued.collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -120,6 +140,24 @@ mod tests {
     fn a_wave_forgets_itself_after_its_part_of_a_period() {
         let values: Vec<f64> = (0..2000).map(|t| (TAU * f64::from(t) / 40.0).sin()).collect();
         // cos(2 pi lag / 40) = 1/e at lag 7.6.
+        let secs = MotionStats::of(&values, false).summary(10.0).autocorrelation_secs.unwrap();
+        assert!((secs - 0.76).abs() < 0.03, "{secs}");
+    }
+
+    #[test]
+    fn a_wrapped_angle_remembers_as_the_turning_does() {
+        let turned: Vec<f64> = (0..400).map(|t| 9.0 * (f64::from(t) * 0.02).sin()).collect();
+        let wrapped: Vec<f64> = turned.iter().map(|a| a - TAU * (a / TAU).round()).collect();
+        let secs =
+            |values: &[f64], is_angle| MotionStats::of(values, is_angle).summary(10.0).autocorrelation_secs;
+        let (expected, got) = (secs(&turned, false).unwrap(), secs(&wrapped, true).unwrap());
+        assert!((expected - got).abs() < 1e-9, "{expected} {got}");
+    }
+
+    #[test]
+    fn missing_values_do_not_move_the_mean() {
+        let mut values: Vec<f64> = (0..2000).map(|t| 5.0 + (TAU * f64::from(t) / 40.0).sin()).collect();
+        values[100..400].fill(f64::NAN);
         let secs = MotionStats::of(&values, false).summary(10.0).autocorrelation_secs.unwrap();
         assert!((secs - 0.76).abs() < 0.03, "{secs}");
     }

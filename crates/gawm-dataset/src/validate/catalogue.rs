@@ -194,6 +194,22 @@ pub const RULES: &[Rule] = &[
         "an episode's picture lags the robot otherwise than in the others",
         "shift the camera by the lag, or drop the episode",
     ),
+    warning(
+        "IMAGE-017",
+        "the picture jumps while the robot does not",
+        "look at both frames: rows of another moment or camera, or lost frames",
+    ),
+    warning(
+        "IMAGE-018",
+        "a camera's picture is turned or mirrored against the other episodes",
+        "turn the pictures of this episode, or leave it out",
+    ),
+    warning("IMAGE-019", "two cameras show the same frames", "find the stream that was mapped twice"),
+    warning(
+        "IMAGE-020",
+        "an episode has the frames of another one",
+        "find the frames that belong to it, or leave the episode out",
+    ),
     error(
         "VALUE-001",
         "values are NaN or infinite",
@@ -253,6 +269,16 @@ pub const RULES: &[Rule] = &[
     info("VALUE-017", "two dims are always equal", "drop one of them"),
     warning("VALUE-018", "a signal drops to zero for single rows", "repair the rows; a reading failed"),
     warning(
+        "VALUE-019",
+        "a signal is coarser than in the other episodes",
+        "check resolution and rate of the sensor in this episode",
+    ),
+    warning(
+        "VALUE-020",
+        "a quaternion's components are in another order than in the other episodes",
+        "reorder them: the order must be declared once and kept",
+    ),
+    warning(
         "SEMANTIC-001",
         "actions are shifted in time against the state",
         "shift them so that the action of row t acts between t and t+1",
@@ -301,6 +327,11 @@ pub const RULES: &[Rule] = &[
         "SEMANTIC-014",
         "the offset between action and state differs from the other episodes",
         "check the zero of this joint",
+    ),
+    warning(
+        "SEMANTIC-015",
+        "states follow their actions at another rate than in the other episodes",
+        "look for rows that are missing or repeated throughout, or for another rate",
     ),
     warning("SPLIT-001", "two episodes are the same", "remove one of them"),
     warning(

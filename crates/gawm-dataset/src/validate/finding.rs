@@ -37,6 +37,9 @@ pub struct Finding {
     pub severity: Severity,
     /// The episode, unless the whole dataset is concerned.
     pub episode: Option<i64>,
+    /// The episodes, where one finding is about several.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub episodes: Vec<i64>,
     /// Rows `[first, end)` within the episode, where they are known.
     pub rows: Option<[u64; 2]>,
     /// The feature concerned.
@@ -60,6 +63,7 @@ impl Finding {
             code,
             severity: Severity::Off,
             episode: None,
+            episodes: Vec::new(),
             rows: None,
             feature: None,
             dim: None,
@@ -74,6 +78,13 @@ impl Finding {
     #[must_use]
     pub fn episode(mut self, episode: i64) -> Finding {
         self.episode = Some(episode);
+        self
+    }
+
+    /// Returns the finding, about several episodes.
+    #[must_use]
+    pub fn episodes(mut self, episodes: Vec<i64>) -> Finding {
+        self.episodes = episodes;
         self
     }
 

@@ -5,10 +5,12 @@ use std::collections::BTreeMap;
 use gawm_image::{ImageError, Limits, decode_thumbnail};
 
 use super::{
-    Finding, Thresholds,
+    Finding, Thresholds, continuity,
+    motion::place_distance,
     profile::RunProfile,
     robust::{Pair, centre_and_scale, median, quantile},
     signal::Stretch,
+    views,
 };
 use crate::read::{DType, Dataset, Defect, FrameBytes, FrameReader, Run};
 
@@ -18,23 +20,27 @@ pub(super) const THUMB_SIDE: usize = 8;
 pub(super) const THUMB: usize = THUMB_SIDE * THUMB_SIDE;
 /// Most pixels of a frame that is decoded.
 const LIMITS: Limits = Limits { max_pixels: 1 << 26 };
+/// States this many usual steps apart are the same: a simulator draws equal pictures of them.
+const SAME_PLACE: f64 = 0.3;
 /// Largest lag of pictures that is looked for, in rows.
 const MAX_LAG: usize = 12;
 
 /// One frame, measured.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct FrameMeasure {
-    hash: u64,
+    pub(super) hash: u64,
     mean: f32,
-    std: f32,
-    is_picture: bool,
-    thumb: [u8; THUMB],
+    pub(super) std: f32,
+    /// Mean of red minus mean of blue.
+    warmth: f32,
+    pub(super) is_picture: bool,
+    pub(super) thumb: [u8; THUMB],
 }
 
 /// The frames of one camera in one run.
 #[derive(Debug, Clone, Default)]
 pub(super) struct CameraRun {
-    frames: Vec<FrameMeasure>,
+    pub(super) frames: Vec<FrameMeasure>,
     undecodable: Vec<(usize, String)>,
     n_undecodable: usize,
     absent: Vec<usize>,
@@ -52,7 +58,8 @@ impl FrameReader for Measurer {
 
     fn frame(&mut self, camera: usize, row: usize, frame: FrameBytes) {
         let run = &mut self.cameras[camera];
-        let mut measure = FrameMeasure { hash: 0, mean: 0.0, std: 0.0, is_picture: false, thumb: [0; THUMB] };
+        let mut measure =
+            FrameMeasure { hash: 0, mean: 0.0, std: 0.0, warmth: 0.0, is_picture: false, thumb: [0; THUMB] };
         match frame {
             FrameBytes::Absent => run.absent.push(row),
             FrameBytes::TooLarge(n) => {
@@ -70,6 +77,7 @@ impl FrameReader for Measurer {
                         let variance = luma.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum::<f64>() / n;
                         (measure.mean, measure.std, measure.is_picture) =
                             (mean as f32, variance.sqrt() as f32, true);
+                        measure.warmth = warmth(&picture.rgb);
                         measure.thumb.copy_from_slice(&picture.shrunk(THUMB_SIDE, THUMB_SIDE).luma());
                         if let Some((height, width, channels)) = self.sizes[camera] {
                             let got =
@@ -115,6 +123,12 @@ impl CameraRun {
     }
 }
 
+/// Returns the mean of red minus the mean of blue.
+fn warmth(rgb: &[u8]) -> f32 {
+    let sum: i64 = rgb.chunks_exact(3).map(|p| i64::from(p[0]) - i64::from(p[2])).sum();
+    sum as f32 / (rgb.len() / 3).max(1) as f32
+}
+
 /// What pictures gave.
 #[derive(Debug, Default)]
 pub(super) struct Judgement {
@@ -152,10 +166,11 @@ pub(super) fn judge(
         judge.flat(&mut findings);
         judge.repeats(&mut findings);
         judge.odd(&mut findings);
+        findings.extend(continuity::judge(thresholds, dataset.info.fps, name, &of_camera));
         judge.exposure(&mut findings);
         judge.lag(&mut findings);
     }
-    exchanged(&cameras, &measured, &by_index, &mut findings);
+    views::judge(&cameras, &measured, &by_index, &mut findings);
     Judgement { findings, defects, pictures: measured }
 }
 
@@ -311,7 +326,8 @@ impl Judge<'_> {
                 &camera.frames.iter().filter(|m| m.is_picture).map(|m| f64::from(f(m))).collect::<Vec<_>>(),
             )
         };
-        let measures: [(&str, Level); 2] = [("brightness", |f| f.mean), ("contrast", |f| f.std)];
+        let measures: [(&str, Level); 3] =
+            [("brightness", |f| f.mean), ("contrast", |f| f.std), ("red minus blue", |f| f.warmth)];
         for (what, measure) in measures {
             let levels: Vec<f64> = self.runs.iter().map(|(_, c)| of(c, measure)).collect();
             let (centre, scale) = centre_and_scale(&levels);
@@ -319,7 +335,11 @@ impl Judge<'_> {
             for ((run, _), level) in
                 self.runs.iter().zip(&levels).filter(|(_, l)| (**l - centre).abs() > bound)
             {
-                let message = format!("{what} is {level:.0} of 255, in the other episodes about {centre:.0}");
+                let mut message =
+                    format!("{what} is {level:.0} of 255, in the other episodes about {centre:.0}");
+                if what == "red minus blue" && (level + centre).abs() < 0.25 * centre.abs() {
+                    message += ": red and blue are exchanged (BGR for RGB)";
+                }
                 findings
                     .push(self.finding("IMAGE-010", run, message).measured((level - centre).abs(), bound));
             }
@@ -383,7 +403,10 @@ fn repeats_of(run: &RunProfile, camera: &CameraRun) -> Repeats {
         if n_rows > repeats.frozen.n_rows {
             repeats.frozen = Stretch { start, n_rows };
         }
-        if seen.insert(frames[t].hash, t).is_some() && speed(t) > 0.5 {
+        if let Some(earlier) = seen.insert(frames[t].hash, t)
+            && (run.places.is_empty() || distance_between(run, earlier, t) > SAME_PLACE)
+            && speed(t) > 0.5
+        {
             repeats.repeated.push(t);
         }
     }
@@ -395,8 +418,19 @@ fn repeats_of(run: &RunProfile, camera: &CameraRun) -> Repeats {
     repeats
 }
 
+/// Returns how many usual steps lie between the states of two rows, or of the rows before them if that is less.
+///
+/// A camera may show the state of the row before.
+fn distance_between(run: &RunProfile, a: usize, b: usize) -> f64 {
+    let far = |a: Option<usize>, b: Option<usize>| {
+        let places = a.zip(b).and_then(|(a, b)| run.places.get(a).zip(run.places.get(b)));
+        places.map_or(f64::INFINITY, |(a, b)| place_distance(a, b))
+    };
+    far(Some(a), Some(b)).min(far(a.checked_sub(1), b.checked_sub(1)))
+}
+
 /// Returns the mean distance of two frames' thumbnails in levels.
-fn distance(a: &FrameMeasure, b: &FrameMeasure) -> f64 {
+pub(super) fn distance(a: &FrameMeasure, b: &FrameMeasure) -> f64 {
     a.thumb.iter().zip(&b.thumb).map(|(x, y)| f64::from(x.abs_diff(*y))).sum::<f64>() / THUMB as f64
 }
 
@@ -424,49 +458,6 @@ fn lag_correlations(run: &RunProfile, camera: &CameraRun) -> Option<Vec<f64>> {
 fn best_lag(correlations: &[f64]) -> (i64, f64) {
     let best = correlations.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1));
     best.map_or((0, 0.0), |(k, c)| (k as i64 - MAX_LAG as i64, *c))
-}
-
-/// Finds episodes in which two cameras have changed places.
-fn exchanged(
-    cameras: &[String],
-    measured: &[(usize, Vec<CameraRun>)],
-    by_index: &BTreeMap<usize, &RunProfile>,
-    findings: &mut Vec<Finding>,
-) {
-    if cameras.len() < 2 || measured.len() < 3 {
-        return;
-    }
-    let mean_thumb = |camera: &CameraRun| -> Vec<f64> {
-        let n = camera.frames.len().max(1) as f64;
-        (0..THUMB).map(|i| camera.frames.iter().map(|f| f64::from(f.thumb[i])).sum::<f64>() / n).collect()
-    };
-    let thumbs: Vec<Vec<Vec<f64>>> =
-        measured.iter().map(|(_, m)| m.iter().map(mean_thumb).collect()).collect();
-    let usual: Vec<Vec<f64>> = (0..cameras.len())
-        .map(|c| (0..THUMB).map(|i| median(&thumbs.iter().map(|t| t[c][i]).collect::<Vec<_>>())).collect())
-        .collect();
-    let far = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| (x - y).abs()).sum::<f64>() / THUMB as f64;
-    for ((run, _), thumbs) in measured.iter().zip(&thumbs) {
-        for a in 0..cameras.len() {
-            for b in a + 1..cameras.len() {
-                let own = far(&thumbs[a], &usual[a]) + far(&thumbs[b], &usual[b]);
-                let other = far(&thumbs[a], &usual[b]) + far(&thumbs[b], &usual[a]);
-                if other < 0.5 * own && own > 10.0 {
-                    let message = format!(
-                        "{} shows what {} shows in the other episodes, and the other way round",
-                        cameras[a], cameras[b]
-                    );
-                    let episode = by_index.get(run).map_or(-1, |r| r.episode);
-                    findings.push(
-                        Finding::new("IMAGE-009", message)
-                            .episode(episode)
-                            .feature(&cameras[a])
-                            .measured(own / other.max(1e-9), 2.0),
-                    );
-                }
-            }
-        }
-    }
 }
 
 /// The episodes that a video file shows.

@@ -111,7 +111,7 @@ pub(super) fn layouts(dataset: &Dataset) -> Vec<FeatureLayout> {
 
 fn layout_of(feature: &FeatureDecl, schema: Option<&Schema>) -> FeatureLayout {
     let width = feature.width();
-    let has_names = feature.names.len() == width;
+    let has_names = feature.names.len() == width && !feature.names.iter().all(|n| is_numbered(n));
     let purpose = match feature.name.as_str() {
         "gawm.state" | "gawm.action" => Purpose::Encoded,
         "action" => Purpose::Action,
@@ -149,7 +149,6 @@ fn apply_schema(layout: &mut FeatureLayout, typed: &gawm_schema::Feature) {
         _ => Purpose::Other,
     };
     let FeatureData::Vector { parts, .. } = &typed.data else { return };
-    layout.has_names = true;
     let mut at = 0;
     for part in parts {
         let group = match part.kind {
@@ -177,6 +176,15 @@ fn apply_schema(layout: &mut FeatureLayout, typed: &gawm_schema::Feature) {
             at += 1;
         }
     }
+    layout.has_names = !layout.names.iter().all(|n| is_numbered(n));
+}
+
+/// Returns whether a name only counts: `3`, `data_3`, `dim3`.
+fn is_numbered(name: &str) -> bool {
+    let word = name.trim_end_matches(|c: char| c.is_ascii_digit());
+    let word = word.trim_end_matches(['_', '.', '-', '[']).to_ascii_lowercase();
+    name.ends_with(|c: char| c.is_ascii_digit())
+        && matches!(word.as_str(), "" | "data" | "dim" | "value" | "element" | "x")
 }
 
 /// Takes what the names of dims say where nothing is declared.

@@ -4,7 +4,8 @@ use super::{
     Finding, Thresholds,
     group::{GroupMeasure, measure_groups},
     layout::{FeatureLayout, GroupKind, Purpose},
-    signal::{Signal, Stretch, measure},
+    motion::{MotionProfile, Place, motion_profile, places, share_of_range},
+    signal::{Signal, measure},
     time::{TimeProfile, time_profile},
     tracking::{Tracking, track},
 };
@@ -12,6 +13,10 @@ use crate::read::{Dataset, EpisodeRows};
 
 /// Points of a trajectory's fingerprint.
 pub(super) const FINGERPRINT_POINTS: usize = 24;
+/// Rows between the points of an aligned trajectory.
+pub(super) const ALIGNED_ROWS: usize = 16;
+/// Most runs of which aligned trajectories are kept.
+const MAX_ALIGNED_RUNS: usize = 20_000;
 /// One row hash in this many is kept.
 const KEPT_ROW_HASHES: u64 = 8;
 
@@ -28,6 +33,8 @@ pub(super) struct Plan {
     pub(super) window_rows: usize,
     /// Whether the speed of each row is kept, for rules about images.
     pub(super) keeps_speed: bool,
+    /// Whether trajectories are kept at a fixed distance of rows, for copies that were cut.
+    pub(super) keeps_aligned: bool,
     /// Names of validity columns.
     pub(super) validity: Vec<String>,
 }
@@ -48,7 +55,8 @@ impl Plan {
         let validity =
             dataset.info.features.iter().filter(|f| f.name.starts_with("gawm.valid") && f.is_numeric());
         let validity = validity.map(|f| f.name.clone()).collect();
-        Plan { layouts, states, actions, pairs, window_rows, keeps_speed, validity }
+        let keeps_aligned = dataset.runs.len() <= MAX_ALIGNED_RUNS;
+        Plan { layouts, states, actions, pairs, window_rows, keeps_speed, keeps_aligned, validity }
     }
 
     /// Returns the layout and name of a dim.
@@ -102,29 +110,14 @@ pub(super) struct RunProfile {
     pub(super) content_hash: [u8; 16],
     pub(super) row_hashes: Vec<u64>,
     pub(super) fingerprint: Vec<f32>,
+    /// The same at a fixed distance of rows, from the begin and from the end.
+    pub(super) aligned: [Vec<f32>; 2],
     pub(super) speed: Vec<f32>,
+    /// Where the robot is in each row: sums of all state dims in units of their usual steps.
+    pub(super) places: Vec<Place>,
     pub(super) n_windows: u64,
     pub(super) n_good_windows: u64,
     pub(super) task_indices: Vec<i64>,
-}
-
-/// Motion of all state dims together.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub(super) struct MotionProfile {
-    /// Steps that look like several: (row, number of steps).
-    pub(super) squeezed: Vec<(usize, f64)>,
-    /// Rows in motion that equal the row before in all state dims.
-    pub(super) repeated: Vec<usize>,
-    pub(super) n_repeated: usize,
-    /// Longest stretch of equal rows, and the second longest.
-    pub(super) longest_rest: Stretch,
-    pub(super) second_rest: usize,
-    /// Share of the action's range that it moves in the longest rest.
-    pub(super) rest_drive: f64,
-    /// Share of rows that are idle.
-    pub(super) idle_share: f64,
-    /// Share of steps without any change.
-    pub(super) rest_share: f64,
 }
 
 /// Measures one run.
@@ -146,8 +139,10 @@ pub(super) fn profile_run(
     let mut findings = super::row_checks::check_rows(dataset, rows);
     let (time, time_findings) = time_profile(dataset, thresholds, rows);
     findings.extend(time_findings);
+    // What moves in bursts, as a gripper, has small usual steps: its mean counts.
+    let scale = |s: &Signal| s.step.max(s.mean_step);
     let scales: Vec<f64> =
-        plan.states.iter().map(|&(f, d)| features[f].as_ref().map_or(0.0, |p| p.dims[d].step)).collect();
+        plan.states.iter().map(|&(f, d)| features[f].as_ref().map_or(0.0, |p| scale(&p.dims[d]))).collect();
     let (motion, speed) = motion_profile(&states, &actions, &scales);
     let rest_drive = plan.pairs.iter().map(|&(a, s)| rest_drive(plan, &features, &actions, a, s)).collect();
     let (content_hash, row_hashes) = hash_rows(&states, &actions, n_rows);
@@ -169,7 +164,13 @@ pub(super) fn profile_run(
         content_hash,
         row_hashes,
         fingerprint: fingerprint(states.iter().chain(&actions), n_rows),
+        aligned: [false, true].map(|from_end| {
+            let columns =
+                if plan.keeps_aligned { states.iter().chain(&actions) } else { [].iter().chain(&[]) };
+            aligned_points(columns, n_rows, from_end)
+        }),
         speed: if plan.keeps_speed { speed } else { Vec::new() },
+        places: if plan.keeps_speed { places(&states, &scales) } else { Vec::new() },
         n_windows,
         n_good_windows,
         task_indices,
@@ -185,8 +186,11 @@ fn feature_profile(
     if dims.len() != layout.width() {
         return None;
     }
-    let signals: Vec<Signal> =
+    let mut signals: Vec<Signal> =
         dims.iter().zip(&layout.kinds).map(|(values, kind)| measure(values, *kind)).collect();
+    if layout.purpose != Purpose::Action {
+        drop_common_rests(dims, &mut signals);
+    }
     let tolerance = |kind: GroupKind| match kind {
         GroupKind::Quaternion => thresholds.value.quaternion_norm,
         GroupKind::SinCos => thresholds.value.circle,
@@ -210,6 +214,23 @@ fn feature_profile(
         rest_motion,
         equal_dims,
     })
+}
+
+/// Takes back plateaus in which another dim that moves elsewhere rests as well: a thing that was put down.
+fn drop_common_rests(dims: &[Vec<f64>], signals: &mut [Signal]) {
+    for d in 0..dims.len() {
+        let Some(clipped) = signals[d].clipped else { continue };
+        let rows = clipped.first.start..clipped.first.end();
+        let rests = |other: usize| {
+            other != d
+                && !signals[other].is_constant()
+                && signals[other].rest_share < 0.9
+                && dims[other][rows.clone()].windows(2).all(|w| w[0] == w[1])
+        };
+        if (0..dims.len()).any(rests) {
+            signals[d].clipped = None;
+        }
+    }
 }
 
 /// Returns how much the other dims move in the longest rest of dim `d`, relative to their usual motion.
@@ -248,121 +269,6 @@ fn rest_drive(
     share_of_range(action, profile.dims[dim].longest_rest)
 }
 
-fn share_of_range(values: &[f64], stretch: Stretch) -> f64 {
-    let range = |values: &[f64]| {
-        let (min, max) =
-            values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(*v), b.max(*v)));
-        max - min
-    };
-    let whole = range(values);
-    // The first rows may still carry the motion that led to the rest.
-    let begin = (stretch.start + stretch.n_rows / 4).min(values.len());
-    let here = range(&values[begin..stretch.end().min(values.len())]);
-    if whole > 0.0 && here.is_finite() { here / whole } else { 0.0 }
-}
-
-fn motion_profile(states: &[&Vec<f64>], actions: &[&Vec<f64>], scales: &[f64]) -> (MotionProfile, Vec<f32>) {
-    let mut profile = MotionProfile::default();
-    let n = states.first().map_or(0, |s| s.len());
-    if n < 8 {
-        return (profile, vec![0.0; n]);
-    }
-    let used: Vec<usize> = (0..states.len()).filter(|d| scales[*d] > 0.0).collect();
-    let step = |d: usize, t: usize| (states[d][t + 1] - states[d][t]) / scales[d];
-    let mut speed = vec![0.0f32; n];
-    let mut is_equal = vec![true; n - 1];
-    for &d in &used {
-        for t in 0..n - 1 {
-            let s = step(d, t);
-            is_equal[t] &= s == 0.0;
-            // One dim must not carry the whole: it is bounded at ten usual steps.
-            speed[t + 1] += (s.abs().min(10.0) / used.len() as f64) as f32;
-        }
-    }
-    let speeds: Vec<f64> = speed.iter().skip(1).map(|v| f64::from(*v)).collect();
-    let usual = super::robust::median(&speeds);
-    let fast = super::robust::quantile(&speeds, 0.9);
-    profile.idle_share = speeds.iter().filter(|v| **v < 0.02 * fast).count() as f64 / speeds.len() as f64;
-    profile.rest_share = is_equal.iter().filter(|e| **e).count() as f64 / is_equal.len() as f64;
-    if used.is_empty() {
-        return (profile, speed);
-    }
-    for t in 2..n - 3 {
-        let around = 0.25 * (speeds[t - 2] + speeds[t - 1] + speeds[t + 1] + speeds[t + 2]);
-        if around < 0.5 * usual {
-            continue;
-        }
-        if is_equal[t] && !is_equal[t - 1] && !is_equal[t + 1] {
-            profile.n_repeated += 1;
-            if profile.repeated.len() < 64 {
-                profile.repeated.push(t + 1);
-            }
-        } else if speeds[t] > 2.0 * around {
-            let steps = squeezed_steps(&used, &step, t);
-            if steps > 2.0 {
-                profile.squeezed.push((t + 1, steps));
-            }
-        }
-    }
-    row_rests(&is_equal, &mut profile);
-    let drives = actions.iter().map(|a| share_of_range(a, profile.longest_rest));
-    profile.rest_drive = drives.fold(0.0, f64::max);
-    (profile, speed)
-}
-
-/// Returns how many steps at the speed before and after fit into the step at `t`, 0 if that is no explanation.
-///
-/// Either the step points where the robot was going, or most dims make a long step at once.
-fn squeezed_steps(used: &[usize], step: &impl Fn(usize, usize) -> f64, t: usize) -> f64 {
-    let (mut dv, mut vv, mut dd, mut top) = (0.0, 0.0, 0.0, 0.0f64);
-    let mut ratios = Vec::with_capacity(used.len());
-    for &d in used {
-        let (before, after) =
-            (0.5 * (step(d, t - 2) + step(d, t - 1)), 0.5 * (step(d, t + 1) + step(d, t + 2)));
-        let (here, v) = (step(d, t), 0.5 * (before + after));
-        dv += here * v;
-        vv += v * v;
-        dd += here * here;
-        top = top.max(here * here);
-        // Steps are in units of the dim's usual step: a dim at rest is measured by that.
-        ratios.push(here.abs() / before.abs().max(after.abs()).max(0.5));
-    }
-    // A jump of one dim alone is another matter.
-    if used.len() >= 2 && top > 0.9 * dd {
-        return 0.0;
-    }
-    let long = ratios.iter().filter(|r| **r > 2.0).count();
-    let ratio = super::robust::median(&ratios);
-    if vv > 0.0 && dv > 0.9 * (dd * vv).sqrt() {
-        dv / vv
-    } else if used.len() >= 3 && long as f64 >= 0.6 * used.len() as f64 {
-        ratio
-    } else {
-        0.0
-    }
-}
-
-fn row_rests(is_equal: &[bool], profile: &mut MotionProfile) {
-    let mut current = Stretch { start: 0, n_rows: 1 };
-    let mut end = |rest: Stretch| {
-        if rest.n_rows > profile.longest_rest.n_rows {
-            profile.second_rest = profile.longest_rest.n_rows;
-            profile.longest_rest = rest;
-        } else {
-            profile.second_rest = profile.second_rest.max(rest.n_rows);
-        }
-    };
-    for (t, equal) in is_equal.iter().enumerate() {
-        if *equal {
-            current.n_rows += 1;
-        } else {
-            end(current);
-            current = Stretch { start: t + 1, n_rows: 1 };
-        }
-    }
-    end(current);
-}
-
 /// Hashes states and actions: all rows together, and a fixed share of the single rows.
 fn hash_rows(states: &[&Vec<f64>], actions: &[&Vec<f64>], n_rows: usize) -> ([u8; 16], Vec<u64>) {
     let columns: Vec<&[f64]> = states.iter().chain(actions).map(|c| c.as_slice()).collect();
@@ -397,6 +303,20 @@ fn fingerprint<'a>(columns: impl Iterator<Item = &'a &'a Vec<f64>>, n_rows: usiz
     }
     let row = |point: usize| point * (n_rows - 1) / (FINGERPRINT_POINTS - 1);
     columns.flat_map(|c| (0..FINGERPRINT_POINTS).map(|p| c[row(p)] as f32)).collect()
+}
+
+/// Returns the trajectory at every sixteenth row from the begin or the end, [dim, point]; NaN beyond the episode.
+fn aligned_points<'a>(
+    columns: impl Iterator<Item = &'a &'a Vec<f64>>,
+    n_rows: usize,
+    from_end: bool,
+) -> Vec<f32> {
+    let at = |column: &[f64], point: usize| {
+        let row = point * ALIGNED_ROWS;
+        let row = if from_end { (n_rows).checked_sub(row + 1) } else { Some(row) };
+        row.and_then(|r| column.get(r)).map_or(f32::NAN, |v| *v as f32)
+    };
+    columns.flat_map(|c| (0..FINGERPRINT_POINTS).map(move |p| at(c, p))).collect()
 }
 
 /// Returns which rows no training window may touch.

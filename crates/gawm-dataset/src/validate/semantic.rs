@@ -2,17 +2,24 @@
 
 use super::{
     Finding, Severity, Thresholds,
+    motion::Squeeze,
     profile::{Plan, RunProfile},
     robust::{Pair, centre_and_scale, median, quantile},
-    tracking::{NO_SHIFT, SHIFTS, Tracking},
+    tracking::{NO_SHIFT, PairProfile, SHIFTS, Tracking},
     value::known_factor,
 };
 use crate::read::Dataset;
 
 /// Fewest runs whose comparison says something about one of them.
 const MIN_RUNS: usize = 3;
+/// Fewest runs whose response to actions is compared, and the least ratio that is reported.
+const MIN_RESPONSES: usize = 5;
+const RESPONSE_RATIO: f64 = 1.3;
 /// A residual so small that the action is a copy of the state: ln(1e-3).
 const COPIED: f64 = -6.9;
+
+/// Steps of the state per action that a difference in the state's own unit brings about.
+const DELTA_GAIN: std::ops::Range<f64> = 0.2..3.0;
 
 /// Judges actions against states, motion, tasks and labels.
 pub(super) fn judge(
@@ -31,6 +38,7 @@ pub(super) fn judge(
         judge.deltas(&mut findings);
         judge.signs_and_scales(&mut findings);
         judge.offsets(&mut findings);
+        judge.responses(&mut findings);
     }
     motion(dataset, thresholds, runs, &mut findings);
     labels(dataset, plan, thresholds, runs, &mut findings);
@@ -113,6 +121,18 @@ impl Judge<'_> {
                 let finding =
                     Finding::new("SEMANTIC-001", message).episode(run.episode).feature(self.action_feature());
                 findings.push(finding.rows(0, run.n_rows).measured(by as f64, 0.0));
+            } else if here != usual
+                && profile[usual] - profile[here] > 0.7
+                && typical[here] - typical[usual] > 0.35
+            {
+                let message = format!(
+                    "the motion is explained best by the action {} rows before it, in the other episodes {}",
+                    NO_SHIFT as i64 - here as i64,
+                    NO_SHIFT as i64 - usual as i64
+                );
+                let finding =
+                    Finding::new("SEMANTIC-001", message).episode(run.episode).feature(self.action_feature());
+                findings.push(finding.rows(0, run.n_rows).measured(here as f64 - usual as f64, 0.0));
             } else if profile[here] > 0.2 * typical[usual] && typical[usual] < -0.5 {
                 let message = format!(
                     "the action explains {:.0} % of the state's unsteady motion, in the other episodes {:.0} %",
@@ -254,15 +274,7 @@ impl Judge<'_> {
         let n_delta = counts.iter().filter(|c| is_delta(c)).count();
         if n_delta * 2 > counts.len() {
             if !self.is_labelled_delta() {
-                let message = format!(
-                    "actions follow the state's next step, not its value, in {n_delta} of {} episodes",
-                    counts.len()
-                );
-                findings.push(
-                    Finding::new("SEMANTIC-003", message)
-                        .feature(self.action_feature())
-                        .measured(n_delta as f64, 0.0),
-                );
+                findings.push(self.delta_everywhere(n_delta));
             }
             return;
         }
@@ -276,6 +288,37 @@ impl Judge<'_> {
             findings.push(finding.rows(0, run.n_rows).measured(count.0 as f64 / count.1 as f64, 0.5));
         }
         self.single_deltas(&counts, findings);
+    }
+
+    /// Returns the finding on actions that act like differences in most episodes.
+    ///
+    /// A difference of the state in its own unit brings about a step of its own size; a speed or a normalised command
+    /// does not, and is none that was mislabelled, unless its label says that it has the state's unit.
+    fn delta_everywhere(&self, n_delta: usize) -> Finding {
+        let gain = |pair: &Pair| pair.correlation() * pair.scale().abs();
+        let best = |p: &PairProfile| {
+            p.delta.iter().max_by(|a, b| a.correlation().total_cmp(&b.correlation())).map_or(0.0, gain)
+        };
+        let moving =
+            |t: &&Tracking| t.pairs.iter().filter(|p| p.residuals.is_some()).map(best).collect::<Vec<_>>();
+        let gains: Vec<f64> = self.tracked.iter().flat_map(|(_, t)| moving(t)).collect();
+        let gain = median(&gains);
+        let unit = |(f, d): (usize, usize)| self.plan.layouts[f].units[d].trim().to_ascii_lowercase();
+        let has_unit = self.plan.pairs.iter().all(|(a, s)| {
+            let (action, state) = (unit(self.plan.actions[*a]), unit(self.plan.states[*s]));
+            action == state && !matches!(action.as_str(), "" | "1" | "none")
+        });
+        let n = self.tracked.len();
+        let text =
+            format!("actions follow the state's next step, not its value, in {n_delta} of {n} episodes");
+        let finding = if has_unit || DELTA_GAIN.contains(&gain) {
+            Finding::new("SEMANTIC-003", text)
+        } else {
+            let message =
+                format!("{text}: they act like speeds, an action of 1 moves the state by {gain:.3} a row");
+            Finding::new("SEMANTIC-003", message).at(Severity::Info)
+        };
+        finding.feature(self.action_feature()).measured(n_delta as f64, 0.0)
     }
 
     /// Finds single dims that are differences in one episode only.
@@ -395,6 +438,29 @@ impl Judge<'_> {
         }
     }
 
+    /// Compares how fast states follow their actions: rows that are missing or repeated throughout change that.
+    fn responses(&self, findings: &mut Vec<Finding>) {
+        let known: Vec<(&RunProfile, f64)> = self
+            .tracked
+            .iter()
+            .filter_map(|(run, t)| t.response.filter(|r| *r > 0.0).map(|r| (*run, r.ln())))
+            .collect();
+        if known.len() < MIN_RESPONSES {
+            return;
+        }
+        let (centre, scale) = centre_and_scale(&known.iter().map(|k| k.1).collect::<Vec<_>>());
+        let bound = (self.thresholds.semantic.offset_sigmas * scale).max(RESPONSE_RATIO.ln());
+        for (run, response) in known.iter().filter(|(_, r)| (r - centre).abs() > bound) {
+            let ratio = (response - centre).exp();
+            let message = format!(
+                "the state follows its action {ratio:.2} times as fast as in the other episodes: rows are missing or repeated throughout, or the rate is another"
+            );
+            let finding =
+                Finding::new("SEMANTIC-015", message).episode(run.episode).feature(self.action_feature());
+            findings.push(finding.rows(0, run.n_rows).measured(ratio, bound.exp()));
+        }
+    }
+
     fn offsets(&self, findings: &mut Vec<Finding>) {
         if self.tracked.len() < MIN_RUNS {
             return;
@@ -435,7 +501,8 @@ fn motion(dataset: &Dataset, thresholds: &Thresholds, runs: &[RunProfile], findi
     let bounds = &thresholds.time;
     let n_rows: usize = runs.iter().map(|r| r.n_rows).sum::<usize>().max(1);
     let squeezed = |run: &RunProfile| {
-        run.motion.squeezed.iter().filter(|(_, n)| *n > bounds.squeezed_steps).copied().collect::<Vec<_>>()
+        let is_event = |s: &&Squeeze| s.is_event(bounds.squeezed_steps);
+        run.motion.squeezed.iter().filter(is_event).copied().collect::<Vec<_>>()
     };
     let n_squeezed: usize = runs.iter().map(|r| squeezed(r).len()).sum();
     let n_repeated: usize = runs.iter().map(|r| r.motion.n_repeated).sum();
@@ -449,11 +516,11 @@ fn motion(dataset: &Dataset, thresholds: &Thresholds, runs: &[RunProfile], findi
     let usual_rest = if runs.len() >= MIN_RUNS { quantile(&rests, 0.5) } else { 0.0 };
     for run in runs {
         let events = squeezed(run);
-        if let Some((row, _)) = events.first()
+        if let Some(Squeeze { row, .. }) = events.first()
             && !is_stepping
             && (n_squeezed as f64) < 0.005 * n_rows as f64
         {
-            let worst = events.iter().map(|e| e.1).fold(0.0, f64::max);
+            let worst = events.iter().map(|e| e.steps).fold(0.0, f64::max);
             let message = format!(
                 "the robot moves as far as in {worst:.1} rows within one, {} times: rows are missing",
                 events.len()

@@ -51,6 +51,8 @@ pub(super) struct Signal {
     pub(super) spread: f64,
     /// Median size of the steps that are not zero.
     pub(super) step: f64,
+    /// Mean size of all steps.
+    pub(super) mean_step: f64,
     /// Share of steps that are exactly zero.
     pub(super) rest_share: f64,
     /// 99th percentile of the unsteadiness.
@@ -60,6 +62,8 @@ pub(super) struct Signal {
     pub(super) jumps: Vec<Jump>,
     pub(super) n_jumps: usize,
     pub(super) longest_rest: Stretch,
+    /// The value in the longest rest.
+    pub(super) rest_level: f64,
     pub(super) second_rest: usize,
     pub(super) clipped: Option<Clipping>,
     pub(super) n_wraps: usize,
@@ -75,7 +79,7 @@ pub(super) struct Signal {
     pub(super) n_not_bool: usize,
 }
 
-/// Plateaus at an extremum that begin and end abruptly.
+/// Plateaus at an extremum, at least one of which the signal reaches and leaves at speed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Clipping {
     pub(super) level: f64,
@@ -106,6 +110,7 @@ pub(super) fn measure(values: &[f64], kind: DimKind) -> Signal {
     step_measures(values, &steps, &mut signal);
     unsteadiness(&steps, &mut signal);
     rests(&steps, &mut signal);
+    signal.rest_level = values[signal.longest_rest.start];
     signal.clipped = clipping(values, &steps, &signal);
     zero_drops(values, &mut signal);
     signal
@@ -195,6 +200,7 @@ fn step_measures(values: &[f64], steps: &[f64], signal: &mut Signal) {
         net += step;
     }
     signal.rest_share = if n == 0 { 1.0 } else { n_zero as f64 / n as f64 };
+    signal.mean_step = total / n.max(1) as f64;
     signal.one_way = if total > 0.0 { (net / total).abs() } else { 0.0 };
     let stride = steps.len().div_ceil(4096).max(1);
     let sizes: Vec<f64> = steps.iter().step_by(stride).map(|s| s.abs()).filter(|s| *s > 0.0).collect();
@@ -279,7 +285,9 @@ fn rests(steps: &[f64], signal: &mut Signal) {
     end(current, signal);
 }
 
-/// Finds plateaus at the largest or the smallest value that the signal enters or leaves at speed.
+/// Finds plateaus at the largest or the smallest value that the signal enters and leaves at speed.
+///
+/// A signal that only stops there comes to rest: an object that was put down, a motion that begins.
 fn clipping(values: &[f64], steps: &[f64], signal: &Signal) -> Option<Clipping> {
     let sizes: Vec<f64> = steps.iter().take(4096).map(|s| s.abs()).filter(|s| *s > 0.0).collect();
     let quantum = sizes.iter().copied().fold(f64::INFINITY, f64::min);
@@ -290,7 +298,7 @@ fn clipping(values: &[f64], steps: &[f64], signal: &Signal) -> Option<Clipping> 
     let fast = 0.3 * signal.step;
     let mut worst: Option<Clipping> = None;
     for level in [signal.max, signal.min] {
-        let mut found: Option<Clipping> = None;
+        let (mut found, mut is_cut): (Option<Clipping>, bool) = (None, false);
         let mut t = 0;
         while t < values.len() {
             if values[t] != level {
@@ -298,9 +306,11 @@ fn clipping(values: &[f64], steps: &[f64], signal: &Signal) -> Option<Clipping> 
                 continue;
             }
             let n_rows = values[t..].iter().take_while(|v| **v == level).count();
-            let enters = t >= 2 && steps[t - 1].abs() > fast && steps[t - 2].abs() > fast;
+            // The step onto a plateau and the step off it are cut off themselves.
+            let enters = t >= 2 && steps[t - 2].abs() > fast;
             let end = t + n_rows;
-            let leaves = end + 1 < values.len() && steps[end - 1].abs() > fast && steps[end].abs() > fast;
+            let leaves = end + 1 < values.len() && steps[end].abs() > fast;
+            is_cut |= n_rows >= 3 && enters && leaves;
             if n_rows >= 3 && (enters || leaves) {
                 let clipping = found.get_or_insert(Clipping {
                     level,
@@ -313,7 +323,7 @@ fn clipping(values: &[f64], steps: &[f64], signal: &Signal) -> Option<Clipping> 
             }
             t = end;
         }
-        if let Some(found) = found
+        if let Some(found) = found.filter(|_| is_cut)
             && worst.is_none_or(|w| found.n_rows > w.n_rows)
         {
             worst = Some(found);

@@ -3,14 +3,14 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::{
-    Finding, Thresholds,
+    Finding, Thresholds, copies,
     profile::{FINGERPRINT_POINTS, Plan, RunProfile},
     robust::quantile,
 };
 use crate::read::Dataset;
 
 /// Most findings of one kind that are listed.
-const MAX_LISTED: usize = 200;
+pub(super) const MAX_LISTED: usize = 200;
 
 /// Judges duplicates and splits.
 pub(super) fn judge(
@@ -137,7 +137,13 @@ fn exact_duplicates(
     pairs
 }
 
-fn across(code: &'static str, a: i64, b: i64, splits: &BTreeMap<i64, String>, findings: &mut Vec<Finding>) {
+pub(super) fn across(
+    code: &'static str,
+    a: i64,
+    b: i64,
+    splits: &BTreeMap<i64, String>,
+    findings: &mut Vec<Finding>,
+) {
     if let (Some(x), Some(y)) = (splits.get(&a), splits.get(&b))
         && x != y
     {
@@ -184,7 +190,9 @@ fn near_duplicates(
     if usable.len() < 2 || n_dims == 0 {
         return;
     }
-    let Some(points) = normalised(&usable, n_dims) else { return };
+    let spreads = spreads(&usable, n_dims);
+    copies::judge(thresholds, splits, &usable, &spreads, exact, findings);
+    let Some(points) = normalised(&usable, &spreads) else { return };
     let width = points[0].len();
     let bound = thresholds.split.near_sigmas * (width as f64).sqrt();
     // Vectors that are close have close sums: only neighbours in that order are compared.
@@ -218,9 +226,9 @@ fn near_duplicates(
     }
 }
 
-/// Scales fingerprints to unit standard deviation per dim; dims that hardly move are left out.
-fn normalised(runs: &[&RunProfile], n_dims: usize) -> Option<Vec<Vec<f32>>> {
-    let mut kept = Vec::new();
+/// Returns the standard deviation of each dim within episodes.
+fn spreads(runs: &[&RunProfile], n_dims: usize) -> Vec<f64> {
+    let mut all = Vec::new();
     for dim in 0..n_dims {
         let range = dim * FINGERPRINT_POINTS..(dim + 1) * FINGERPRINT_POINTS;
         // The spread within episodes: that between them would hide motion on top of different offsets.
@@ -231,11 +239,16 @@ fn normalised(runs: &[&RunProfile], n_dims: usize) -> Option<Vec<Vec<f32>>> {
                 quantile(&values, 0.9) - quantile(&values, 0.1)
             })
             .collect();
-        let spread = quantile(&spreads, 0.75) / 2.56;
-        if spread > 1e-9 {
-            kept.push((range, spread as f32));
-        }
+        all.push(quantile(&spreads, 0.75) / 2.56);
     }
+    all
+}
+
+/// Scales fingerprints to unit standard deviation per dim; dims that hardly move are left out.
+fn normalised(runs: &[&RunProfile], spreads: &[f64]) -> Option<Vec<Vec<f32>>> {
+    let range = |dim: usize| dim * FINGERPRINT_POINTS..(dim + 1) * FINGERPRINT_POINTS;
+    let moving = spreads.iter().enumerate().filter(|(_, s)| **s > 1e-9);
+    let kept: Vec<_> = moving.map(|(dim, s)| (range(dim), *s as f32)).collect();
     if kept.is_empty() {
         return None;
     }

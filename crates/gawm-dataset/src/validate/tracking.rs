@@ -24,6 +24,8 @@ pub(super) struct PairProfile {
     pub(super) steps: Pair,
     /// The state's next step against the action's value, at delays of 0, 1 and 2 rows.
     pub(super) delta: [Pair; 3],
+    /// The state's next step against its distance from the action.
+    pub(super) pull: Pair,
     /// Median of action minus state.
     pub(super) offset: f64,
     /// Logarithm of the residual with the action shifted, relative to that without an action; `None` for a dim at rest.
@@ -40,6 +42,8 @@ pub(super) struct Tracking {
     pub(super) distance: Vec<f32>,
     /// Variance of the actions.
     pub(super) action_variance: Vec<f64>,
+    /// Share of the distance to its action by which the state moves in a row: the median over dims that follow.
+    pub(super) response: Option<f64>,
     /// Mean of the residuals over dims.
     pub(super) profile: Option<[f64; SHIFTS]>,
 }
@@ -73,7 +77,17 @@ pub(super) fn track(
     });
     let (step_correlation, distance) = matrices(actions, states, n);
     let action_variance = actions.iter().map(|a| variance(a)).collect();
-    Some(Tracking { pairs: profiles, step_correlation, distance, action_variance, profile })
+    let response = response(&profiles);
+    Some(Tracking { response, pairs: profiles, step_correlation, distance, action_variance, profile })
+}
+
+/// Returns the usual pull of dims that follow their action.
+fn response(profiles: &[PairProfile]) -> Option<f64> {
+    let follows =
+        |p: &&PairProfile| p.residuals.is_some() && p.level.correlation() > 0.6 && p.pull.correlation() > 0.7;
+    let pulls: Vec<f64> =
+        profiles.iter().filter(follows).map(|p| p.pull.correlation() * p.pull.scale().abs()).collect();
+    (pulls.len() >= 2).then(|| median(&pulls))
 }
 
 fn variance(values: &[f64]) -> f64 {
@@ -114,6 +128,7 @@ fn pair_profile(action: &[f64], state: &[f64]) -> PairProfile {
         level: Pair::default(),
         steps: Pair::default(),
         delta: [Pair::default(); 3],
+        pull: Pair::default(),
         offset: f64::NAN,
         residuals: residuals(action, state, stride),
     };
@@ -124,6 +139,7 @@ fn pair_profile(action: &[f64], state: &[f64]) -> PairProfile {
         for (delay, pair) in profile.delta.iter_mut().enumerate() {
             pair.add(action[t], state[t + delay + 1] - state[t + delay]);
         }
+        profile.pull.add(action[t] - state[t], state[t + 1] - state[t]);
         offsets.push(action[t] - state[t + 1]);
     }
     profile.offset = median(&offsets);

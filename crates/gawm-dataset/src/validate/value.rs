@@ -8,6 +8,7 @@ use super::{
     layout::{DimKind, Group, GroupKind, Purpose},
     profile::{FeatureProfile, Plan, RunProfile},
     robust::{centre_and_scale, median, quantile},
+    rotations, saturation,
     signal::{NOISE_ROWS, Signal},
 };
 
@@ -17,7 +18,11 @@ const MIN_RUNS: usize = 4;
 const IDLE_SHARE: f64 = 0.05;
 /// Rows at the begin of an episode in which controllers settle: only large jumps count there.
 const SETTLING_ROWS: usize = 8;
-
+/// What at least this many episodes and this share of all show is their nature.
+const USUAL_RUNS: usize = 6;
+const USUAL_SHARE: f64 = 0.25;
+/// Share of rows that repeat the value before, of a signal that hardly ever does elsewhere.
+const COARSE_SHARE: f64 = 0.2;
 /// Share of runs in which a group of dims must keep its constraint to be recognised.
 const RECOGNISED_RUNS: f64 = 0.6;
 
@@ -49,21 +54,21 @@ pub(super) fn judge(plan: &Plan, thresholds: &Thresholds, fps: f64, runs: &[RunP
     findings
 }
 
-struct Judge<'a> {
-    plan: &'a Plan,
-    thresholds: &'a Thresholds,
+pub(super) struct Judge<'a> {
+    pub(super) plan: &'a Plan,
+    pub(super) thresholds: &'a Thresholds,
     fps: f64,
-    feature: usize,
-    profiles: &'a [(&'a RunProfile, &'a FeatureProfile)],
+    pub(super) feature: usize,
+    pub(super) profiles: &'a [(&'a RunProfile, &'a FeatureProfile)],
 }
 
 impl Judge<'_> {
-    fn finding(&self, code: &'static str, dim: usize, message: String) -> Finding {
+    pub(super) fn finding(&self, code: &'static str, dim: usize, message: String) -> Finding {
         let layout = &self.plan.layouts[self.feature];
         Finding::new(code, message).feature(&layout.name).dim(&layout.names[dim])
     }
 
-    fn signals(&self, dim: usize) -> impl Iterator<Item = (&RunProfile, &Signal)> {
+    pub(super) fn signals(&self, dim: usize) -> impl Iterator<Item = (&RunProfile, &Signal)> {
         self.profiles.iter().map(move |(run, profile)| (*run, &profile.dims[dim]))
     }
 
@@ -89,11 +94,13 @@ impl Judge<'_> {
             self.constant_everywhere(dim, findings);
         } else {
             self.constant_here(dim, moving, findings);
-            self.stuck(dim, kind, findings);
-            self.saturated(dim, kind, findings);
+            findings.extend(self.unless_usual(self.stuck(dim, kind)));
+            saturation::judge(self, dim, kind, findings);
             if !self.is_idle(dim) {
-                self.jumps(dim, kind, findings);
-                self.noise(dim, kind, findings);
+                findings.extend(self.unless_usual(self.jumps(dim, kind)));
+                self.zero_drops(dim, kind, findings);
+                self.noisy(dim, kind, findings);
+                findings.extend(self.unless_usual(self.coarse(dim, kind)));
             }
             self.wraps(dim, kind, findings);
             self.offset(dim, kind, findings);
@@ -115,6 +122,30 @@ impl Judge<'_> {
         }
     }
 
+    /// Makes one note of findings that many episodes share: what is usual is the nature of the data.
+    fn unless_usual(&self, found: Vec<Finding>) -> Vec<Finding> {
+        let is_usual =
+            found.len() >= USUAL_RUNS && found.len() as f64 >= USUAL_SHARE * self.profiles.len() as f64;
+        if is_usual { self.as_note(found) } else { found }
+    }
+
+    fn as_note(&self, mut found: Vec<Finding>) -> Vec<Finding> {
+        let n_runs = self.profiles.len();
+        let size = |f: &Finding| f.measured.unwrap_or(0.0);
+        let Some(worst) = found.iter().max_by(|a, b| size(a).total_cmp(&size(b))).cloned() else {
+            return found;
+        };
+        let episodes = found.drain(..).filter_map(|f| f.episode).collect::<Vec<_>>();
+        let message = format!(
+            "in {} of {n_runs} episodes, so by nature; most in episode {}: {}",
+            episodes.len(),
+            worst.episode.unwrap_or(-1),
+            worst.message
+        );
+        let note = Finding { episode: None, rows: None, message, ..worst };
+        vec![note.at(Severity::Info).episodes(episodes)]
+    }
+
     fn constant_everywhere(&self, dim: usize, findings: &mut Vec<Finding>) {
         let levels: Vec<f64> =
             self.signals(dim).filter(|(_, s)| s.n_finite > 0).map(|(_, s)| s.min).collect();
@@ -122,12 +153,29 @@ impl Judge<'_> {
         if levels.iter().all(|l| l == first) {
             let is_target = self.plan.layouts[self.feature].purpose == Purpose::Action;
             let what = if is_target { "the action" } else { "the value" };
-            findings.push(self.finding(
-                "VALUE-002",
-                dim,
-                format!("{what} is {first} in every row of the dataset"),
-            ));
+            let mut message = format!("{what} is {first} in every row of the dataset");
+            // A command may be held for good; a sensor that stays while it is commanded to move is broken.
+            let is_moving = !is_target && self.has_moving_partner(dim);
+            if is_moving {
+                message += ", while its action moves: was it connected?";
+            }
+            let finding = self.finding("VALUE-002", dim, message);
+            findings.push(if is_moving { finding.at(Severity::Warning) } else { finding });
         }
+    }
+
+    /// Returns whether the action of a state moves in most episodes.
+    fn has_moving_partner(&self, dim: usize) -> bool {
+        let here = (self.feature, dim);
+        let own = self.plan.pairs.iter().filter(|(_, s)| self.plan.states[*s] == here);
+        let mut partners = own.map(|(a, _)| self.plan.actions[*a]);
+        partners.any(|(feature, other)| {
+            let moves = |run: &RunProfile| {
+                let signal = run.features[feature].as_ref().map(|p| &p.dims[other]);
+                signal.is_some_and(|s| s.n_finite > 1 && !s.is_constant())
+            };
+            2 * self.profiles.iter().filter(|(run, _)| moves(run)).count() > self.profiles.len()
+        })
     }
 
     fn constant_here(&self, dim: usize, moving: usize, findings: &mut Vec<Finding>) {
@@ -146,23 +194,35 @@ impl Judge<'_> {
                 signal.min, run.n_rows
             );
             let finding = self.finding("SEMANTIC-004", dim, message).episode(run.episode).rows(0, run.n_rows);
-            let is_at_zero = signal.min == 0.0 && self.rests_at_zero(dim);
+            let is_at_zero =
+                signal.min == 0.0 && self.rests_at_zero(dim) || self.is_end_elsewhere(dim, signal.min);
             findings.push(if is_at_zero { finding.at(Severity::Info) } else { finding });
         }
     }
 
-    /// Returns whether the dim is never negative and touches zero in most episodes, as a force without contact does.
-    fn rests_at_zero(&self, dim: usize) -> bool {
-        let n_zero = self.signals(dim).filter(|(_, s)| !s.is_constant() && s.min == 0.0).count();
-        let n_moving = self.signals(dim).filter(|(_, s)| !s.is_constant()).count();
-        2 * n_zero > n_moving && self.signals(dim).all(|(_, s)| s.n_finite == 0 || s.min >= 0.0)
+    /// Returns whether two other episodes or more end exactly at `level`: a wall, or where the robot starts.
+    fn is_end_elsewhere(&self, dim: usize, level: f64) -> bool {
+        let moving = self.signals(dim).filter(|(_, s)| !s.is_constant());
+        moving.filter(|(_, s)| s.min == level || s.max == level).count() >= 2
     }
 
-    fn stuck(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
+    /// Returns whether the dim is never negative and comes near zero in most episodes, as a force without contact does.
+    fn rests_at_zero(&self, dim: usize) -> bool {
+        let moving = || self.signals(dim).filter(|(_, s)| !s.is_constant());
+        let highest = moving().map(|(_, s)| s.max).fold(0.0, f64::max);
+        let n_zero = moving().filter(|(_, s)| s.min <= 0.01 * highest).count();
+        2 * n_zero > moving().count() && self.signals(dim).all(|(_, s)| s.n_finite == 0 || s.min >= 0.0)
+    }
+
+    fn stuck(&self, dim: usize, kind: DimKind) -> Vec<Finding> {
+        let mut findings = Vec::new();
         let bounds = &self.thresholds.value;
         if matches!(kind, DimKind::Bool | DimKind::Gripper) {
-            return;
+            return findings;
         }
+        // A policy may hold a command; a sensor that holds a value is broken.
+        let is_action = self.plan.layouts[self.feature].purpose == Purpose::Action;
+        let ratio = if is_action { 2.0 * bounds.stuck_ratio } else { bounds.stuck_ratio };
         let shortest = (bounds.stuck_secs * self.fps).max(bounds.stuck_rows);
         let rests: Vec<f64> = self
             .signals(dim)
@@ -176,19 +236,24 @@ impl Judge<'_> {
             if signal.is_constant() || (rest.n_rows as f64) < shortest {
                 continue;
             }
-            let elsewhere = if rests.len() >= 3 { quantile(&rests, 0.5) } else { 0.0 };
+            let elsewhere = match rests.as_slice() {
+                [] | [_] => 0.0,
+                [a, b] => a.min(*b),
+                all => quantile(all, 0.5),
+            };
             let usual = elsewhere.max(signal.second_rest as f64);
             let others_move = profile.rest_motion[dim] > 0.3;
             let is_driven = pair.is_some_and(|p| run.rest_drive[p] > 0.1);
             let outside =
                 1.0 - (1.0 - signal.rest_share) * run.n_rows as f64 / (run.n_rows - rest.n_rows + 1) as f64;
-            let is_unusual = rest.n_rows as f64 > bounds.stuck_ratio * usual && outside < 0.5;
+            let is_unusual = rest.n_rows as f64 > ratio * usual && outside < 0.5;
             let is_single = self.plan.layouts[self.feature].width() == 1;
-            if is_unusual && (others_move || is_driven || is_single) {
+            // What rests until it is first touched is no sensor that stops.
+            let is_waiting = rest.start == 0 && !is_driven;
+            if is_unusual && !is_waiting && (others_move || is_driven || is_single) {
                 let mut message = format!(
                     "the value stays exactly {:.6} for {} rows; it usually rests for {usual:.0}",
-                    self.level(run, dim),
-                    rest.n_rows
+                    signal.rest_level, rest.n_rows
                 );
                 message += if is_driven {
                     ", and its action moves meanwhile"
@@ -197,56 +262,28 @@ impl Judge<'_> {
                 };
                 let finding =
                     self.finding("VALUE-003", dim, message).episode(run.episode).rows(rest.start, rest.end());
-                let finding = finding.measured(rest.n_rows as f64, bounds.stuck_ratio * usual);
-                let is_at_zero = signal.median == 0.0 && self.rests_at_zero(dim);
-                findings.push(if is_at_zero { finding.at(Severity::Info) } else { finding });
+                let finding = finding.measured(rest.n_rows as f64, ratio * usual);
+                let is_at_rest = signal.rest_level == 0.0 && self.rests_at_zero(dim)
+                    || self.is_end_elsewhere(dim, signal.rest_level);
+                findings.push(if is_at_rest { finding.at(Severity::Info) } else { finding });
             }
         }
+        findings
     }
 
-    fn level(&self, run: &RunProfile, dim: usize) -> f64 {
-        run.features[self.feature].as_ref().map_or(f64::NAN, |p| p.dims[dim].median)
-    }
-
-    fn saturated(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
+    fn jumps(&self, dim: usize, kind: DimKind) -> Vec<Finding> {
+        let mut findings = Vec::new();
         let bounds = &self.thresholds.value;
-        if matches!(kind, DimKind::Bool | DimKind::Gripper | DimKind::Rotation) {
-            return;
-        }
-        let is_action = self.plan.layouts[self.feature].purpose == Purpose::Action;
-        let bound = if is_action { bounds.saturated_action_share } else { bounds.saturated_share };
-        for (run, signal) in self.signals(dim) {
-            let Some(clipped) = signal.clipped else { continue };
-            let share = clipped.n_rows as f64 / run.n_rows as f64;
-            if share >= bounds.saturated_share && (clipped.n_plateaus >= 2 || clipped.n_rows >= 5) {
-                let message = format!(
-                    "the value is cut off at {:.6} in {} rows ({:.1} %), {} plateaus reached at speed",
-                    clipped.level,
-                    clipped.n_rows,
-                    100.0 * share,
-                    clipped.n_plateaus
-                );
-                let finding = self
-                    .finding("VALUE-004", dim, message)
-                    .episode(run.episode)
-                    .rows(clipped.first.start, clipped.first.end());
-                let finding = if share >= bound { finding } else { finding.at(Severity::Info) };
-                findings.push(finding.measured(share, bound));
-            }
-        }
-    }
-
-    fn jumps(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
-        let bounds = &self.thresholds.value;
-        let rest = self.typical(dim, |s| s.rest_share);
-        if matches!(kind, DimKind::Bool | DimKind::Gripper) || rest > 0.9 {
-            return;
+        let is_stepped =
+            matches!(kind, DimKind::Bool | DimKind::Gripper) || saturation::is_bang_bang(self, dim);
+        if is_stepped || self.typical(dim, |s| s.rest_share) > 0.9 {
+            return findings;
         }
         let usual = self.typical(dim, |s| s.rough99);
         let range = self.typical(dim, Signal::range);
         let floor = (bounds.jump_ratio * usual).max(bounds.jump_range_share * range);
         if usual <= 0.0 || floor <= 0.0 {
-            return;
+            return findings;
         }
         let n_rows: usize = self.profiles.iter().map(|(run, _)| run.n_rows).sum();
         let counts: Vec<usize> =
@@ -258,17 +295,23 @@ impl Judge<'_> {
                 && n_jumping * 2 > counts.len()
                 && counts.iter().sum::<usize>() > 3 * counts.len());
         if is_stepping {
-            return;
+            return findings;
         }
         for (run, signal) in self.signals(dim) {
             if kind == DimKind::Rotation && self.has_flips(run, dim) {
                 continue;
             }
+            // All dims jump where rows are missing: that is said once.
+            let most = self.thresholds.time.squeezed_steps;
+            let is_squeezed =
+                |row: usize| run.motion.squeezed.iter().any(|s| s.row == row && s.is_event(most));
             let mut jumps: Vec<_> = signal
                 .jumps
                 .iter()
                 .filter(|j| j.size > floor && !signal.zero_drops.contains(&j.row))
-                .filter(|j| j.row > SETTLING_ROWS || j.size > 0.5 * range)
+                .filter(|j| !is_squeezed(j.row))
+                // Of the last step nothing tells whether it goes on.
+                .filter(|j| (j.row > SETTLING_ROWS && j.row + 1 < run.n_rows) || j.size > 0.5 * range)
                 .collect();
             jumps.sort_by_key(|j| j.row);
             let Some(first) = jumps.first() else { continue };
@@ -281,6 +324,13 @@ impl Judge<'_> {
             let finding =
                 self.finding("VALUE-005", dim, message).episode(run.episode).rows(first.row, first.row + 1);
             findings.push(finding.measured(worst / usual, floor / usual));
+        }
+        findings
+    }
+
+    fn zero_drops(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
+        if matches!(kind, DimKind::Bool | DimKind::Gripper) || self.typical(dim, |s| s.rest_share) > 0.9 {
+            return;
         }
         for (run, signal) in self.signals(dim) {
             if let Some(first) = signal.zero_drops.first() {
@@ -302,16 +352,45 @@ impl Judge<'_> {
         profile.is_some_and(|p| p.groups.iter().filter(holds).any(|g| g.n_flips > 0))
     }
 
-    fn noise(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
+    fn noisy(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
+        // Controllers settle at the begin of episodes: that several do so is one thing to say.
+        let at_start = |f: &Finding| f.rows.is_some_and(|r| r[0] == 0);
+        let (start, rest): (Vec<Finding>, Vec<Finding>) =
+            self.noise(dim, kind).into_iter().partition(at_start);
+        let usual_start = start.len() >= USUAL_RUNS;
+        let start = if usual_start { self.as_note(start) } else { start };
+        if usual_start {
+            findings.extend(start);
+            findings.extend(self.unless_usual(rest));
+        } else {
+            findings.extend(self.unless_usual(start.into_iter().chain(rest).collect()));
+        }
+    }
+
+    fn noise(&self, dim: usize, kind: DimKind) -> Vec<Finding> {
+        let mut findings = Vec::new();
         let bounds = &self.thresholds.value;
         if matches!(kind, DimKind::Bool | DimKind::Gripper) || self.typical(dim, |s| s.rest_share) > 0.5 {
-            return;
+            return findings;
         }
         let usual = self.typical(dim, |s| s.noise90);
         let step = self.typical(dim, |s| s.step);
         for (run, signal) in self.signals(dim).filter(|(_, s)| !s.is_constant()) {
             let Some((window, level)) = signal.noisiest else { continue };
-            if level > bounds.noise_ratio * usual && level > step && usual > 0.0 {
+            let (whole, others) = (signal.rough50, self.typical(dim, |s| s.rough50));
+            if self.profiles.len() >= MIN_RUNS
+                && whole > 1.4 * bounds.noise_ratio * others
+                && whole > 0.1 * step
+                && others > 0.0
+            {
+                let message =
+                    format!("the signal is {:.0} times as unsteady as in the other episodes", whole / others);
+                let finding =
+                    self.finding("VALUE-015", dim, message).episode(run.episode).rows(0, run.n_rows);
+                findings.push(finding.measured(whole / others, bounds.noise_ratio));
+                continue;
+            }
+            if level > bounds.noise_ratio * usual && level > 0.3 * step && usual > 0.0 {
                 let message = format!(
                     "{NOISE_ROWS} rows are {:.0} times noisier than the noisiest tenth elsewhere",
                     level / usual
@@ -323,6 +402,39 @@ impl Judge<'_> {
                 findings.push(finding.measured(level / usual, bounds.noise_ratio));
             }
         }
+        findings
+    }
+
+    /// Finds episodes in which a signal that always moves stays for several rows again and again.
+    fn coarse(&self, dim: usize, kind: DimKind) -> Vec<Finding> {
+        let mut findings = Vec::new();
+        let usual = self.typical(dim, |s| s.rest_share);
+        if self.profiles.len() < MIN_RUNS || usual > 0.03 || matches!(kind, DimKind::Bool | DimKind::Gripper)
+        {
+            return findings;
+        }
+        let spread = self.typical(dim, |s| s.spread);
+        for (run, signal) in self.signals(dim) {
+            // What is cut off at a level is said elsewhere.
+            if signal.is_constant() || signal.clipped.is_some() || signal.spread <= 0.3 * spread {
+                continue;
+            }
+            let rest = signal.longest_rest.n_rows as f64;
+            let n = run.n_rows as f64;
+            // A single long rest is another matter.
+            let share = (signal.rest_share * (n - 1.0) - (rest - 1.0)) / (n - rest).max(1.0);
+            if share > COARSE_SHARE && run.n_rows >= 20 {
+                let message = format!(
+                    "{:.0} % of the rows repeat the value before, in the other episodes {:.0} %: a coarse or slow sensor",
+                    100.0 * share,
+                    100.0 * usual
+                );
+                let finding =
+                    self.finding("VALUE-019", dim, message).episode(run.episode).rows(0, run.n_rows);
+                findings.push(finding.measured(share, COARSE_SHARE));
+            }
+        }
+        findings
     }
 
     fn wraps(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
@@ -459,7 +571,9 @@ impl Judge<'_> {
             let small: Vec<f64> = ratios.iter().map(|(_, s, l)| s.max(*l)).collect();
             let bound = self.thresholds.value.scale_ratio;
             let (large, small) = (median(&both), median(&small));
-            if large > bound || (small < 1.0 / bound && small > 0.0) {
+            // An episode of small motion is no episode in another unit.
+            let is_small = small < 1.0 / bound && !known_factor(small).is_empty();
+            if large > bound || is_small {
                 let ratio = if large > bound { large } else { small };
                 let message = format!(
                     "values and steps are {ratio:.3} times those of the other episodes{}",
@@ -474,9 +588,8 @@ impl Judge<'_> {
                 continue;
             }
             for (d, step, level) in ratios {
-                let is_known = |r: f64| !known_factor(r).is_empty();
                 let ratio = (step * level).abs().sqrt();
-                if is_known(ratio) && (step / level).ln().abs() < 0.9 {
+                if ratio > 1.0 && !known_factor(ratio).is_empty() && (step / level).ln().abs() < 0.9 {
                     let message = format!(
                         "values and steps are {ratio:.3} times those of the other episodes{}",
                         known_factor(ratio)
@@ -512,6 +625,7 @@ impl Judge<'_> {
             }
         }
         for group in &groups {
+            rotations::judge_order(self, *group, findings);
             self.judge_group(*group, layout.groups.contains(group), findings);
         }
         groups

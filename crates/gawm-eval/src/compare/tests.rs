@@ -53,13 +53,22 @@ fn runs_become_a_table_with_paired_intervals() {
     let table = compare(&folders);
     assert_eq!(table.columns, ["two-room reference published"]);
     assert_eq!(table.rows[..3], ["sa-idm", "lewm", "untrained"]);
-    let cell = table.cells.iter().find(|cell| cell.row == "lewm").unwrap();
-    assert_eq!((cell.seeds.len(), cell.pooled.n), (2, 12));
+    let cell = |table: &CompareTable, row: &str| {
+        let cell = table.cells.iter().find(|cell| cell.row == row).unwrap();
+        (cell.seeds.len(), cell.pooled.n)
+    };
+    assert_eq!(cell(&table, "lewm"), (2, 12));
+    // All four had the same problems and the same untrained weights.
+    assert_eq!(cell(&table, "untrained"), (1, 6));
     assert_eq!(table.duels.len(), 1);
     let pairs = table.duels[0].difference.pairs;
     assert_eq!(pairs.both + pairs.only_first + pairs.only_second + pairs.neither, 12);
     let markdown = table.to_markdown();
     assert!(markdown.contains("| sa-idm - lewm | two-room reference published |"), "{markdown}");
+
+    let labelled = folders.map(|folder| PlanFolder { label: Some("both".to_owned()), ..folder });
+    let table = compare(&labelled);
+    assert_eq!((cell(&table, "both"), table.duels.len()), ((4, 24), 0));
 }
 
 #[test]

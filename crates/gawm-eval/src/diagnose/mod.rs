@@ -10,6 +10,7 @@ mod retrieval;
 mod rollouts;
 mod trajectory;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -28,7 +29,7 @@ use crate::suite::ModelFacts;
 pub const DIAGNOSE_VERSION: u32 = 1;
 
 /// What is diagnosed.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DiagnoseOptions {
     /// Number of trajectories.

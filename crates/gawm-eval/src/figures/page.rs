@@ -11,7 +11,7 @@ h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2.2rem;border-bottom:1px sol
 p.note{color:var(--muted);max-width:48rem}table{border-collapse:collapse;font-size:.9rem;display:block;overflow-x:auto}
 td,th{border:1px solid var(--line);padding:.25rem .6rem;text-align:right}td:first-child,th:first-child{text-align:left}
 th{background:var(--soft)}figure{display:inline-block;margin:.4rem .6rem .4rem 0;max-width:100%;overflow-x:auto}
-img{max-width:100%}code{font-size:.9em}";
+img,svg{max-width:100%;height:auto}code{font-size:.9em}";
 
 /// A page under construction.
 #[derive(Debug, Clone)]

@@ -1,10 +1,11 @@
 //! What a user may say about planning.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 /// How the search goes.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Method {
     /// Cross-entropy method.
@@ -19,7 +20,7 @@ pub enum Method {
 }
 
 /// Which implementation is repeated.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Compat {
     /// Ours.
@@ -30,7 +31,7 @@ pub enum Compat {
 }
 
 /// Weights of the parts of a cost.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ObjectiveWeights {
     /// Squared distance of the last latent to the goal's, summed over its values. The only one for headline numbers.
@@ -48,7 +49,7 @@ impl Default for ObjectiveWeights {
 }
 
 /// Settings of a planner. The default is the published size with our repairs.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlannerConfig {
     /// How the search goes.
@@ -156,6 +157,11 @@ impl PlannerConfig {
         let positive = |value: f32| value.is_finite() && value > 0.0;
         let share = |value: f32| (0.0..1.0).contains(&value);
         let ObjectiveWeights { latent, state, smoothness } = self.objective;
+        let kept_most = match self.method {
+            Method::Icem => self.elites.min(self.samples.saturating_sub(1)),
+            // The others keep none.
+            _ => usize::MAX,
+        };
         let counts = [
             ("samples", self.samples, 2, MAX_SAMPLES, "2 to 100000"),
             ("iterations", self.iterations, 1, 10_000, "1 to 10000"),
@@ -163,13 +169,7 @@ impl PlannerConfig {
             ("horizon", self.horizon, 1, 1000, "1 to 1000"),
             ("receding", self.receding, 1, self.horizon, "1 to the horizon"),
             ("history", self.history, 1, 1024, "1 to the history of the model"),
-            (
-                "kept_elites",
-                self.kept_elites,
-                0,
-                self.elites.min(self.samples - 1),
-                "0 to the number of elites",
-            ),
+            ("kept_elites", self.kept_elites, 0, kept_most, "0 to the number of elites"),
         ];
         for (field, got, low, high, expected) in counts {
             if got < low || got > high {

@@ -3,16 +3,20 @@
 use candle_core::{Device, Result, Tensor, Var};
 use gawm_model::{Stream, permutation};
 
-use super::ProbeOptions;
+use super::{ProbeOptions, Scale};
 
 /// Rows of a mini-batch.
 const BATCH: usize = 256;
+/// Fewest steps of the optimiser: a pass over few rows is no more than a handful of them.
+const MIN_STEPS: usize = 1500;
 
 /// Linear, ReLU, linear; all dims at once.
 #[derive(Debug, Clone)]
 pub(super) struct Mlp {
     parameters: [Var; 4],
     d: usize,
+    /// Mean and standard deviation of the targets: what is fitted is standardised, whatever the unit of a dim.
+    targets: Scale,
 }
 
 impl Mlp {
@@ -39,15 +43,20 @@ impl Mlp {
             init("second", hidden, s, hidden)?,
             Var::zeros((1, s), candle_core::DType::F32, &device)?,
         ];
-        let mlp = Mlp { parameters, d };
+        let targets = Scale::fit(y.iter().copied(), s);
+        let mlp = Mlp { parameters, d, targets };
         let n = x.len() / d;
         let mask: Vec<f32> = y.iter().map(|value| f32::from(u8::from(value.is_finite()))).collect();
-        let y: Vec<f32> = y.iter().map(|value| if value.is_finite() { *value as f32 } else { 0.0 }).collect();
+        let mut y: Vec<f32> = y.iter().map(|value| *value as f32).collect();
+        mlp.targets.apply(&mut y);
+        y.iter_mut().filter(|value| !value.is_finite()).for_each(|value| *value = 0.0);
         let (x, y) = (Tensor::from_slice(x, (n, d), &device)?, Tensor::from_vec(y, (n, s), &device)?);
         let mask = Tensor::from_vec(mask, (n, s), &device)?;
         let mut adam = Adam::new(&mlp.parameters)?;
-        let steps = options.epochs * n.div_ceil(BATCH);
-        for epoch in 0..options.epochs {
+        let batches = n.div_ceil(BATCH).max(1);
+        let epochs = options.epochs.max(MIN_STEPS.div_ceil(batches));
+        let steps = epochs * batches;
+        for epoch in 0..epochs {
             let order = permutation(&mut Stream::new(seed, "probe/order", epoch as u64), n as u32);
             for rows in order.chunks(BATCH) {
                 let index = Tensor::from_slice(rows, rows.len(), &device)?;
@@ -76,7 +85,9 @@ impl Mlp {
             return Ok(Vec::new());
         }
         let x = Tensor::from_slice(x, (n, self.d), &Device::Cpu)?;
-        self.forward(&x)?.flatten_all()?.to_vec1()
+        let mut y = self.forward(&x)?.flatten_all()?.to_vec1()?;
+        self.targets.undo(&mut y);
+        Ok(y)
     }
 }
 

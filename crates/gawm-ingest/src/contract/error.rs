@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use gawm_schema::pipeline::OverrideError;
 use thiserror::Error;
 
 /// Why a contract cannot be used. All of these are exit code 2.
@@ -19,11 +20,14 @@ pub enum ContractError {
     /// It is not TOML, or a key is unknown or of the wrong type.
     #[error("{path}: {detail}")]
     Syntax {
-        /// The file, or `--set`.
+        /// The file, with `--set` where one was given.
         path: String,
         /// Place, what was expected, what was there.
         detail: String,
     },
+    /// An override does not fit.
+    #[error(transparent)]
+    Override(#[from] OverrideError),
     /// The task schema that it names cannot be used.
     #[error("task schema {schema:?}: {detail}")]
     TaskSchema {
@@ -55,7 +59,7 @@ impl ContractError {
             ContractError::Read { .. } => {
                 Some("write a first contract with `gawm-ingest suggest LOG > contract.toml`".to_owned())
             }
-            ContractError::Syntax { .. } => Some(
+            ContractError::Syntax { .. } | ContractError::Override(_) => Some(
                 "docs/contract.md lists every key; `run --print-config` shows the resolved contract"
                     .to_owned(),
             ),

@@ -3,10 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// How logs become a dataset: the `[ingest]` section of a pipeline, or a file of its own.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Contract {
     /// Version of this format; only 1 exists.
@@ -67,7 +68,7 @@ impl Default for Contract {
 }
 
 /// Which time decides what is known at a tick.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Causal {
     /// The clock that each stream states.
@@ -78,7 +79,7 @@ pub enum Causal {
 }
 
 /// When rows are made.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TicksSpec {
     /// How ticks are laid.
@@ -95,7 +96,7 @@ pub struct TicksSpec {
 }
 
 /// How ticks are laid.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum TickMode {
     /// A fixed rate from the first instant of each episode at which all required streams are there.
@@ -108,7 +109,7 @@ pub enum TickMode {
 }
 
 /// What becomes of one topic, or of several that a pattern matches.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StreamSpec {
     /// Unique name, used for ages and messages; from the topic by default.
@@ -185,7 +186,7 @@ fn is_zero(value: &f64) -> bool {
 }
 
 /// What a column is for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum RoleSpec {
     /// Measured physical state.
@@ -201,7 +202,7 @@ pub enum RoleSpec {
 }
 
 /// How a value at tick t is made of samples.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum AlignSpec {
     /// The last sample at or before t, no older than the tolerance.
@@ -217,7 +218,7 @@ pub enum AlignSpec {
 }
 
 /// What happens where no sample is usable.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum GapRule {
     /// The episode ends before the gap and another begins after it.
@@ -232,7 +233,7 @@ pub enum GapRule {
 }
 
 /// What happens to samples with NaN or infinite values.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum NonFiniteRule {
     /// The row is kept; the feature is NaN and not valid in it.
@@ -245,7 +246,7 @@ pub enum NonFiniteRule {
 }
 
 /// What values are geometrically.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum KindSpec {
     /// A Euclidean quantity.
@@ -270,7 +271,7 @@ pub enum KindSpec {
 }
 
 /// How commands become the action of row t, which acts between tick t and the next.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ActionSpec {
     /// Which commands count.
@@ -293,7 +294,7 @@ pub struct ActionSpec {
 }
 
 /// Which commands count for a row.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ActionTimingSpec {
     /// The last command at or before t.
@@ -307,7 +308,7 @@ pub enum ActionTimingSpec {
 }
 
 /// How the commands of a window become one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ReduceSpec {
     /// The last one.
@@ -321,7 +322,7 @@ pub enum ReduceSpec {
 }
 
 /// The frame of rotation deltas.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum DeltaFrame {
     /// Deltas are about the axes of a fixed base: the later one is applied on the left.
@@ -332,7 +333,7 @@ pub enum DeltaFrame {
 }
 
 /// What a derived action is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum DerivedSpec {
     /// The state of the next row.
@@ -342,7 +343,7 @@ pub enum DerivedSpec {
 }
 
 /// What is done to images.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ImageSpec {
     /// Part that is kept: x, y, width, height in pixels of the recorded image.
@@ -365,7 +366,7 @@ pub struct ImageSpec {
 }
 
 /// How images are stored.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ImageFormat {
     /// JPEG and PNG as recorded; raw images, and all that are cropped or resized, as PNG.
@@ -378,7 +379,7 @@ pub enum ImageFormat {
 }
 
 /// Where episodes begin and end.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EpisodesSpec {
     /// What separates episodes.
@@ -438,7 +439,7 @@ impl Default for EpisodesSpec {
 }
 
 /// What separates episodes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum EpisodeSource {
     /// One recording is one episode.
@@ -453,7 +454,7 @@ pub enum EpisodeSource {
 }
 
 /// A value that a marker is compared with.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged)]
 pub enum MarkerValue {
     /// Truth value.
@@ -467,7 +468,7 @@ pub enum MarkerValue {
 }
 
 /// Unit of a time in metadata.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum TimeUnit {
     /// Nanoseconds.
@@ -478,7 +479,7 @@ pub enum TimeUnit {
 }
 
 /// Task, success, operator, robot and session of each episode.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LabelsSpec {
     /// Regular expression on the path of the log as given; named groups `task`, `success`, `operator`, `robot`, `session` fill what has no other source.
@@ -514,7 +515,7 @@ pub struct LabelsSpec {
 }
 
 /// Where a label comes from.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged)]
 pub enum LabelSource {
     /// The same for all.
@@ -532,7 +533,7 @@ pub enum LabelSource {
 }
 
 /// A label from a topic.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TopicLabel {
     /// Topic, exact.
@@ -542,7 +543,7 @@ pub struct TopicLabel {
 }
 
 /// A label from a metadata record.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct MetadataLabel {
     /// Name of the record.
@@ -552,7 +553,7 @@ pub struct MetadataLabel {
 }
 
 /// A label from the path.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CaptureLabel {
     /// Name of the group.
@@ -560,7 +561,7 @@ pub struct CaptureLabel {
 }
 
 /// A label from the side file.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ColumnLabel {
     /// Name of the column.
@@ -568,7 +569,7 @@ pub struct ColumnLabel {
 }
 
 /// What is kept of calibrations.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CalibrationSpec {
     /// Whether attachments (URDF, calibration files) are copied to `meta/`.
@@ -584,7 +585,7 @@ impl Default for CalibrationSpec {
 }
 
 /// How much is held back for validation.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SplitSpec {
     /// Share of sessions (of episodes where no session is known) that are for validation, 0 to 1.

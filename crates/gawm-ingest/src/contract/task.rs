@@ -5,12 +5,13 @@
 
 use std::path::Path;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{Contract, ContractError, StreamSpec};
 
 /// Which schema a contract takes, and which of its state targets.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TaskSchemaSpec {
     /// Name of a built-in schema: `tworoom`, `reacher`, `pusht`, `cube`, `pingpong`.
@@ -34,7 +35,7 @@ const BUILT_IN: [(&str, &str); 5] = [
 ];
 
 /// A state target of a task schema.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum TargetName {
     /// As published: the same values in the same order, for `compat = "reference"`.
@@ -45,7 +46,7 @@ pub enum TargetName {
 }
 
 /// What a task records.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TaskSchema {
     /// Version of this format; only 1 exists.
@@ -66,7 +67,7 @@ pub struct TaskSchema {
 }
 
 /// A state target: the streams of `observation.state` and what is known of the encoded columns.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StateTarget {
     /// The streams, in the order of the columns.

@@ -118,10 +118,9 @@ pub(crate) fn around(
                     is_after: false,
                 });
             };
-            for (group, (range, stamp_ns)) in topic.groups.iter().zip(message.rows(&decoded.rows)) {
-                for (_, columns) in group.streams.iter().filter(|(at, _)| *at == stream && !range.is_empty())
-                {
-                    take(*stamp_ns, decoded.values[range.clone()][columns.clone()].to_vec());
+            for (at, stamp_ns, values) in topic.samples(message.rows(&decoded.rows), &decoded.values) {
+                if at == stream {
+                    take(stamp_ns, values.to_vec());
                 }
             }
             if let Some((_, stamp_ns)) = message.picture().filter(|_| topic.images.contains(&stream)) {

@@ -14,7 +14,7 @@ use thiserror::Error;
 use crate::align::Derivation;
 use crate::contract::{CheckedContract, ContractError, StreamData, TopicPattern, check, parse};
 use crate::decode::SchemaLibrary;
-use crate::run::{BindError, Binding, BoundStream, OpenRecording, RunError};
+use crate::run::{BindError, Binding, BoundStream, OpenRecording, RunError, split_by_publisher};
 use dataset::RowOrigin;
 
 /// Why a number cannot be explained.
@@ -196,13 +196,14 @@ impl OpenSources {
             // Types that are missing now only keep their channels from being shown.
             library.add_folder(folder).ok();
         }
-        let binding =
+        let mut binding =
             Binding::new(contract, &open.name, &open.channels, &library).map_err(|error| match error {
                 BindError::Run(error) => ExplainError::Run(error),
                 BindError::Refused(refusal) => {
                     ExplainError::Log { path: question.dir.to_owned(), detail: refusal.to_string() }
                 }
             })?;
+        split_by_publisher(&mut binding, &open, &library);
         Ok(Some(OpenSources { open, binding, library }))
     }
 }

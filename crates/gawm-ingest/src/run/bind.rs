@@ -12,7 +12,7 @@ use crate::contract::{
     AlignSpec, CheckedContract, CheckedStream, Clock, GapRule, ImageRule, NonFiniteRule, StreamData,
     TickRule, VectorRule,
 };
-use crate::decode::{FieldPath, SchemaLibrary, Segment};
+use crate::decode::{CompileError, FieldPath, SchemaLibrary, Segment};
 use crate::log::Channel;
 use crate::run::plan::{compile_vector, schema_of};
 
@@ -381,6 +381,18 @@ fn stream_rule(stream: &BoundStream) -> StreamRule {
     }
 }
 
+/// Returns whether no contract could map anything of such a channel.
+fn is_fault_of_log(error: &CompileError) -> bool {
+    matches!(
+        error,
+        CompileError::UnsupportedEncoding { .. }
+            | CompileError::NoSchema { .. }
+            | CompileError::BadSchema { .. }
+            | CompileError::ServiceSchema { .. }
+            | CompileError::UnknownType { .. }
+    )
+}
+
 struct Context<'a> {
     contract: &'a CheckedContract,
     log: &'a str,
@@ -518,6 +530,9 @@ impl Context<'_> {
             }
         }
         if let (true, Some(source)) = (stream.columns.is_empty(), first_error) {
+            if is_fault_of_log(&source) {
+                return Err(BindError::Refused(Refusal::Undecodable { stream: stream.name.clone(), source }));
+            }
             return Err(BindError::Run(RunError::Field {
                 file: self.contract.file.clone(),
                 stream: stream.name.clone(),

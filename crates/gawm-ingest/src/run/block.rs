@@ -7,8 +7,8 @@ use std::sync::Arc;
 use bytes::Bytes;
 
 use super::picture::{Picture, loss_reason};
-use super::plan::{ChannelPlan, MappedTopic, Plans, Sinks, schema_of};
-use crate::decode::{CameraInfo, DecodeError, Decoded, RowSink, decode_to_json};
+use super::plan::{ChannelPlan, GroupSinks, MappedTopic, Plans, Row, schema_of};
+use crate::decode::{CameraInfo, DecodeError, RowSink, decode_to_json};
 use crate::log::{Block, Channel, Damage, Message, decompress_message, looks_like_zstd};
 
 /// Largest message that a compressed message may become.
@@ -20,16 +20,13 @@ pub(crate) struct DecodedBlock {
     pub(crate) messages: Vec<DecodedMessage>,
     /// Values that rows have ranges of.
     pub(crate) values: Vec<f64>,
-    /// Of each message and group the range of its values, and its stamp.
+    /// What values messages hold.
     pub(crate) rows: Vec<Row>,
     /// Messages of topics that are not mapped.
     pub(crate) unmapped: Vec<(String, u64)>,
     /// What was lost or odd.
     pub(crate) damage: Vec<Damage>,
 }
-
-/// The range of the values that a group of streams has in a message, and their stamp.
-pub(crate) type Row = (Range<usize>, Option<i64>);
 
 /// One message of a mapped topic.
 #[derive(Debug)]
@@ -44,7 +41,7 @@ pub(crate) struct DecodedMessage {
     pub(crate) length: usize,
     /// File offset of the message or its chunk.
     pub(crate) offset: u64,
-    /// Its rows in the block: one per group, none when it is lost.
+    /// Its rows in the block; none when it is lost or holds no mapped element.
     rows: Range<usize>,
     /// What few messages have.
     extras: Option<Box<Extras>>,
@@ -63,7 +60,7 @@ pub(crate) struct Extras {
 }
 
 impl DecodedMessage {
-    /// Returns the rows of the message, one per group of its topic.
+    /// Returns the rows of the message, in the order of the groups of its topic.
     pub(crate) fn rows<'a>(&self, block_rows: &'a [Row]) -> &'a [Row] {
         block_rows.get(self.rows.clone()).unwrap_or_default()
     }
@@ -101,8 +98,8 @@ const MAX_RESERVED: usize = 1 << 20;
 pub(crate) fn decode_block(read: Block, plans: &Plans) -> DecodedBlock {
     let mut out = DecodedBlock::default();
     let by_channel: Vec<Arc<ChannelPlan>> = read.channels.iter().map(|channel| plans.of(channel)).collect();
-    let mut sinks: Vec<Vec<Sinks>> =
-        by_channel.iter().map(|plan| plan.vectors.iter().map(|_| Sinks::default()).collect()).collect();
+    let mut sinks: Vec<Vec<GroupSinks>> =
+        by_channel.iter().map(|plan| plan.vectors.iter().map(|_| GroupSinks::default()).collect()).collect();
     let mut unmapped = vec![0_u64; read.channels.len()];
     let is_image = |message: &&Message| by_channel[message.channel as usize].image.is_some();
     let image_bytes: usize =
@@ -143,7 +140,7 @@ struct MessageDecoder<'a> {
 }
 
 impl MessageDecoder<'_> {
-    fn decode(&self, message: &Message, sinks: &mut [Sinks], out: &mut DecodedBlock) {
+    fn decode(&self, message: &Message, sinks: &mut [GroupSinks], out: &mut DecodedBlock) {
         let payload = self.block.payload(message);
         let log_ns = i64::try_from(message.log_time_ns).unwrap_or(i64::MAX);
         let publish_ns = match i64::try_from(message.publish_time_ns) {
@@ -177,31 +174,17 @@ impl MessageDecoder<'_> {
         &self,
         message: &Message,
         payload: &[u8],
-        sinks: &mut [Sinks],
+        sinks: &mut [GroupSinks],
         out: &mut DecodedBlock,
     ) -> Result<Option<Box<Extras>>, MessageLoss> {
         let channel = self.block.channel(message);
-        let is_compressed = channel.message_encoding == "cdr" && looks_like_zstd(payload);
-        let payload = if is_compressed {
-            let bytes = decompress_message(payload, MAX_MESSAGE_BYTES)
-                .map_err(|error| MessageLoss { reason: "compressed_message", detail: error.to_string() })?;
-            Cow::Owned(bytes)
-        } else {
-            Cow::Borrowed(payload)
-        };
+        let payload = body(channel, payload)?;
         if let Some(error) = &self.plan.error {
             return Err(MessageLoss { reason: "undecodable", detail: error.to_string() });
         }
-        for (decoder, sinks) in self.plan.vectors.iter().zip(sinks) {
-            sinks.rows.clear();
-            match decoder.decode(&payload, sinks).map_err(|error| loss_of(&error))? {
-                Decoded::Row { stamp_ns } => {
-                    let start = out.values.len();
-                    out.values.extend_from_slice(sinks.rows.values());
-                    out.rows.push((start..out.values.len(), stamp_ns));
-                }
-                Decoded::NotInMessage { .. } => out.rows.push((0..0, None)),
-            }
+        for (group, (decoder, sinks)) in self.plan.vectors.iter().zip(sinks).enumerate() {
+            let to = (&mut out.values, &mut out.rows);
+            decoder.decode(group, &payload, sinks, to).map_err(|error| loss_of(&error))?;
         }
         let topic = &self.plans.topics[self.topic];
         if self.plan.image.is_none() && !topic.is_event && !topic.is_camera_info {
@@ -242,6 +225,16 @@ impl MessageDecoder<'_> {
             Bytes::copy_from_slice(data)
         }
     }
+}
+
+/// Returns the body of a message, which rosbag2 may have compressed.
+pub(crate) fn body<'a>(channel: &Channel, payload: &'a [u8]) -> Result<Cow<'a, [u8]>, MessageLoss> {
+    if channel.message_encoding != "cdr" || !looks_like_zstd(payload) {
+        return Ok(Cow::Borrowed(payload));
+    }
+    decompress_message(payload, MAX_MESSAGE_BYTES)
+        .map(Cow::Owned)
+        .map_err(|error| MessageLoss { reason: "compressed_message", detail: error.to_string() })
 }
 
 fn loss_of(error: &DecodeError) -> MessageLoss {

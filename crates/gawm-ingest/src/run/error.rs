@@ -161,6 +161,14 @@ pub enum Refusal {
         /// Topics of the log.
         topics: Vec<String>,
     },
+    /// The schema of a required topic cannot be used: the log's fault, not the contract's.
+    #[error("stream {stream:?} cannot be decoded: {source}")]
+    Undecodable {
+        /// Name of the stream.
+        stream: String,
+        /// Why.
+        source: CompileError,
+    },
     /// No message of a required stream could be used.
     #[error("stream {stream:?} has no usable sample: {topic} has {read} messages, {detail}")]
     EmptyStream {
@@ -242,6 +250,12 @@ impl Refusal {
             }
             Refusal::EmptyStream { .. } => {
                 Some("gap = \"mask\" makes a stream of numbers optional; `gawm-ingest inspect LOG` shows the topic".to_owned())
+            }
+            Refusal::Undecodable { source: CompileError::NoSchema { .. }, .. } => {
+                Some("schemas = [folder] gives types that the log lacks".to_owned())
+            }
+            Refusal::Undecodable { .. } => {
+                Some("remove the stream from the contract if this log cannot have it; `gawm-ingest inspect LOG` shows which topics can be decoded".to_owned())
             }
             Refusal::NoEpisode { .. } => {
                 Some("larger tolerance_ms, other clocks or episodes.from may fit; `gawm-ingest inspect LOG` shows rates and gaps".to_owned())

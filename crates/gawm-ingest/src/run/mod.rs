@@ -12,16 +12,19 @@ mod picture;
 mod plan;
 mod prefetch;
 mod probe;
+mod publishers;
 mod recording;
 mod report;
 mod session;
 mod sink;
 mod source;
+#[cfg(test)]
+mod tests;
 mod unavailable;
 mod unpack;
 
 #[cfg(test)]
-pub(crate) mod tests;
+pub(crate) mod made_logs;
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -34,6 +37,7 @@ pub(crate) use block::decode_block;
 pub use error::{Refusal, RunError};
 pub(crate) use picture::Picture;
 pub(crate) use plan::{Plans, schema_of};
+pub(crate) use publishers::split as split_by_publisher;
 pub(crate) use recording::OpenRecording;
 pub use report::{FileReport, FileStatus, LostReport, Report, StreamReport, TopicReport};
 pub(crate) use source::Source;
@@ -177,7 +181,7 @@ impl Run<'_> {
             return Ok(FileReport::refused(&path, with_hint(&error, hint)));
         }
         let contract = reduced.as_ref().map_or(self.options.contract, |reduced| &reduced.contract);
-        let binding = match Binding::new(contract, &open.name, &open.channels, &self.library) {
+        let mut binding = match Binding::new(contract, &open.name, &open.channels, &self.library) {
             Ok(binding) => binding,
             Err(BindError::Run(error)) => return Err(error),
             Err(BindError::Refused(refusal)) => {
@@ -185,6 +189,7 @@ impl Run<'_> {
             }
         };
         open.select(&self.topics_of(&binding));
+        publishers::split(&mut binding, &open, &self.library);
         let probed = probe::probe(&open, &binding, self.options.contract, &self.library)?;
         let schema = binding.schema(self.options.contract, probed.rate_hz, &probed.sizes)?;
         if let Some(stream) = probed.without_size.first() {

@@ -1,6 +1,6 @@
 //! What is decoded of each message: compiled once per channel, shared by all threads.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -11,6 +11,9 @@ use crate::decode::{
     SchemaLibrary, Segment, StampSource, StampUnit, Value,
 };
 use crate::log::Channel;
+
+/// Errors list at most this many names of a message.
+const MAX_LISTED_NAMES: usize = 64;
 
 /// Returns what decoding needs to know of a channel.
 pub(crate) fn schema_of(channel: &Channel) -> ChannelSchema<'_> {
@@ -120,13 +123,105 @@ impl VectorDecoder {
     }
 }
 
+/// Decodes a group of streams: all at once, or one by one where a message holds the elements of some of them only.
+///
+/// Several publishers may share a topic, each with joints or frames of its own.
+#[derive(Debug)]
+pub(crate) struct GroupDecoder {
+    whole: VectorDecoder,
+    /// One per stream of the group; none when there is one stream.
+    parts: Vec<VectorDecoder>,
+    /// The names that each stream picks elements by.
+    names: Vec<BTreeSet<String>>,
+}
+
+/// The sinks of a [`GroupDecoder`].
+#[derive(Debug, Default)]
+pub(crate) struct GroupSinks {
+    whole: Sinks,
+    parts: Vec<Sinks>,
+}
+
+/// The values of a group, or of one of its streams, in a message.
+#[derive(Debug, Clone)]
+pub(crate) struct Row {
+    /// Index of the group in its topic.
+    group: u32,
+    /// The stream of the group that they are of; all of them without.
+    part: Option<u32>,
+    values: Range<usize>,
+    pub(crate) stamp_ns: Option<i64>,
+}
+
+impl GroupDecoder {
+    /// Appends the values of a message, and a row for each range of them.
+    pub(crate) fn decode(
+        &self,
+        group: usize,
+        payload: &[u8],
+        sinks: &mut GroupSinks,
+        (values, rows): (&mut Vec<f64>, &mut Vec<Row>),
+    ) -> Result<(), DecodeError> {
+        let mut take = |decoder: &VectorDecoder, sinks: &mut Sinks, part: Option<usize>| {
+            sinks.rows.clear();
+            let outcome = decoder.decode(payload, sinks)?;
+            if let Decoded::Row { stamp_ns } = outcome {
+                let start = values.len();
+                values.extend_from_slice(sinks.rows.values());
+                let part = part.map(|part| part as u32);
+                rows.push(Row { group: group as u32, part, values: start..values.len(), stamp_ns });
+            }
+            Ok(matches!(outcome, Decoded::Row { .. }))
+        };
+        let has_all = match take(&self.whole, &mut sinks.whole, None) {
+            Err(error) if self.parts.is_empty() && is_of_others(&error, &self.names[0]) => return Ok(()),
+            Err(error @ DecodeError::NameAbsent { .. }) if self.parts.is_empty() => return Err(error),
+            Err(DecodeError::NameAbsent { .. }) => false,
+            other => other?,
+        };
+        if has_all {
+            return Ok(());
+        }
+        sinks.parts.resize_with(self.parts.len(), Sinks::default);
+        for (part, ((decoder, names), sinks)) in
+            self.parts.iter().zip(&self.names).zip(&mut sinks.parts).enumerate()
+        {
+            match take(decoder, sinks, Some(part)) {
+                Err(error) if is_of_others(&error, names) => {}
+                other => drop(other?),
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Returns whether a message holds none of the names that are asked for, but others.
+fn is_of_others(error: &DecodeError, names: &BTreeSet<String>) -> bool {
+    match error {
+        DecodeError::NameAbsent { present, .. } => {
+            (1..MAX_LISTED_NAMES).contains(&present.len()) && !present.iter().any(|name| names.contains(name))
+        }
+        _ => false,
+    }
+}
+
+/// Returns the names that paths pick elements by.
+pub(crate) fn picked_names(fields: &[FieldPath]) -> BTreeSet<String> {
+    let segments = fields.iter().flat_map(FieldPath::segments);
+    let name = |segment: &Segment| match segment {
+        Segment::Key { value, .. } => Some(value.clone()),
+        _ => None,
+    };
+    segments.filter_map(name).collect()
+}
+
 /// What is wanted of a topic.
 #[derive(Debug, Default)]
 pub(crate) struct MappedTopic {
     /// Its name.
     pub(crate) topic: String,
     /// Groups of values with one stamp each.
-    pub(crate) groups: Vec<Group>,
+    groups: Vec<Group>,
     /// Streams of images.
     pub(crate) images: Vec<usize>,
     /// Whether whole messages are wanted, for markers and labels.
@@ -141,7 +236,9 @@ pub(crate) struct Group {
     clock: Clock,
     fields: Vec<FieldPath>,
     /// Streams and where their values lie in the row.
-    pub(crate) streams: Vec<(usize, Range<usize>)>,
+    streams: Vec<(usize, Range<usize>)>,
+    /// Where the paths of each stream lie in `fields`.
+    paths: Vec<Range<usize>>,
     width: usize,
 }
 
@@ -161,7 +258,7 @@ pub(crate) struct ChannelPlan {
     /// Index of the topic; none when it is not mapped.
     pub(crate) topic: Option<usize>,
     /// One decoder per group.
-    pub(crate) vectors: Vec<VectorDecoder>,
+    pub(crate) vectors: Vec<GroupDecoder>,
     /// Values that a message gives.
     pub(crate) width: usize,
     /// Takes images out.
@@ -228,7 +325,9 @@ impl Plans {
         plan.width = mapped.groups.iter().map(|group| group.width).sum();
         for group in &mapped.groups {
             match compile_vector(&schema, &group.fields, &group.clock, &self.library) {
-                Ok(decoder) if decoder.columns().len() == group.width => plan.vectors.push(decoder),
+                Ok(whole) if whole.columns().len() == group.width => {
+                    plan.vectors.push(self.with_parts(whole, group, &schema));
+                }
                 Ok(decoder) => {
                     let got = decoder.columns().len();
                     plan.error = Some(CompileError::WrongShape {
@@ -249,9 +348,45 @@ impl Plans {
         }
         plan
     }
+
+    /// Adds what is needed for messages that hold the elements of some streams of a group only.
+    fn with_parts(&self, whole: VectorDecoder, group: &Group, schema: &ChannelSchema<'_>) -> GroupDecoder {
+        let fields = || group.paths.iter().map(|paths| &group.fields[paths.clone()]);
+        let names: Vec<BTreeSet<String>> = fields().map(picked_names).collect();
+        let is_picked = group.streams.len() > 1 && names.iter().any(|names| !names.is_empty());
+        let compile = |fields: &[FieldPath]| compile_vector(schema, fields, &group.clock, &self.library).ok();
+        let parts: Option<Vec<VectorDecoder>> =
+            if is_picked { fields().map(compile).collect() } else { None };
+        match parts {
+            Some(parts) => GroupDecoder { whole, parts, names },
+            None => GroupDecoder { whole, parts: Vec::new(), names: vec![picked_names(&group.fields)] },
+        }
+    }
 }
 
 impl MappedTopic {
+    /// Returns whether numbers are wanted of the topic.
+    pub(crate) fn has_vectors(&self) -> bool {
+        !self.groups.is_empty()
+    }
+
+    /// Returns the samples of a message: stream, stamp and values.
+    pub(crate) fn samples<'a>(
+        &'a self,
+        rows: &'a [Row],
+        values: &'a [f64],
+    ) -> impl Iterator<Item = (usize, Option<i64>, &'a [f64])> {
+        rows.iter().flat_map(move |row| {
+            let values = values.get(row.values.clone()).unwrap_or_default();
+            let streams = self.groups[row.group as usize].streams.iter().enumerate();
+            let is_of = move |part: usize| row.part.is_none_or(|only| only as usize == part);
+            streams.filter(move |(part, _)| is_of(*part)).map(move |(_, (stream, columns))| {
+                let own = if row.part.is_some() { values } else { &values[columns.clone()] };
+                (*stream, row.stamp_ns, own)
+            })
+        })
+    }
+
     fn add(&mut self, stream: usize, bound: &BoundStream) {
         // Log and publish times need no stamp, so such streams share the group of those that do.
         let clock = match &bound.rule.clock {
@@ -260,12 +395,19 @@ impl MappedTopic {
         };
         let at = self.groups.iter().position(|group| group.clock == clock);
         let at = at.unwrap_or_else(|| {
-            self.groups.push(Group { clock, fields: Vec::new(), streams: Vec::new(), width: 0 });
+            self.groups.push(Group {
+                clock,
+                fields: Vec::new(),
+                streams: Vec::new(),
+                paths: Vec::new(),
+                width: 0,
+            });
             self.groups.len() - 1
         });
         let group = &mut self.groups[at];
         let range = group.width..group.width + bound.columns.len();
         group.width = range.end;
+        group.paths.push(group.fields.len()..group.fields.len() + bound.fields.len());
         group.fields.extend(bound.fields.iter().cloned());
         group.streams.push((stream, range));
     }

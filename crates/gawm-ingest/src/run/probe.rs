@@ -86,7 +86,7 @@ pub(crate) fn probe(
             }
             if let Some(stream) = reference.filter(|&stream| binding.streams[stream].topic == topic.topic) {
                 let stamp = message.picture().and_then(|(_, stamp)| *stamp);
-                let stamp = stamp.or(message.rows(&block.rows).iter().find_map(|(_, stamp)| *stamp));
+                let stamp = stamp.or(message.rows(&block.rows).iter().find_map(|row| row.stamp_ns));
                 times.push(match binding.streams[stream].rule.clock {
                     Clock::Log => message.log_ns,
                     Clock::Publish => message.publish_ns,

@@ -16,7 +16,7 @@ use super::report::{AgeCounts, FileReport, FileStatus};
 use super::session::{Session, SessionRules};
 use super::sink::{EpisodeSink, SinkRules};
 use super::source::{OpenError, Source};
-use super::{Refusal, RunError, RunOptions, calibration, gaps, with_hint};
+use super::{Refusal, RunError, RunOptions, calibration, gaps, publishers, with_hint};
 use crate::align::Stop;
 use crate::contract::{CheckedContract, EpisodeRule, GapRule, StreamData};
 use crate::decode::SchemaLibrary;
@@ -344,7 +344,7 @@ fn outcome(
     path: &Path,
     session: Session<'_, '_>,
 ) -> RecordingOutcome {
-    let empty = session.empty_streams();
+    let (empty, empty_optional) = session.empty_streams();
     let Session { sink, mut counts, mut warnings, damage: block_damage, .. } = session;
     let result = sink.outcome;
     let mut damage: Vec<Damage> = open.logs.iter().flat_map(|log| log.damage().iter().cloned()).collect();
@@ -377,16 +377,24 @@ fn outcome(
             result.dropped_intervals.len()
         ));
     }
-    let mut error = None;
-    if let Some(&stream) = empty.first() {
+    let empty_stream = |stream: usize| {
         let bound = &context.binding.streams[stream];
         let losses = counts.losses_of(&bound.topic);
-        let refusal = Refusal::EmptyStream {
+        let absence = || publishers::first_absence(bound, open, context.library);
+        Refusal::EmptyStream {
             stream: bound.name.clone(),
             topic: bound.topic.clone(),
             read: counts.read_of(&bound.topic),
-            detail: if losses.is_empty() { "none lost".to_owned() } else { losses.join("; ") },
-        };
+            detail: match losses.is_empty() {
+                true => absence().unwrap_or_else(|| "none lost".to_owned()),
+                false => losses.join("; "),
+            },
+        }
+    };
+    warnings.extend(empty_optional.into_iter().map(|stream| empty_stream(stream).to_string()));
+    let mut error = None;
+    if let Some(&stream) = empty.first() {
+        let refusal = empty_stream(stream);
         error = Some(with_hint(&refusal.to_string(), refusal.hint()));
     } else if result.episodes == 0 {
         let refusal = Refusal::NoEpisode { detail: no_episode(&result, &warnings) };

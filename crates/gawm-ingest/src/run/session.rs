@@ -7,9 +7,9 @@ use std::collections::{BTreeMap, VecDeque};
 use gawm_schema::{FloatType, Kind, Role, rotation};
 
 use super::bind::Binding;
-use super::block::{DecodedBlock, DecodedMessage, Row};
+use super::block::{DecodedBlock, DecodedMessage};
 use super::picture::Picture;
-use super::plan::Plans;
+use super::plan::{Plans, Row};
 use super::report::Counts;
 use super::sink::{EpisodeSink, IntervalInfo};
 use crate::align::{AlignRule, Aligner, SampleTime, Stop};
@@ -405,34 +405,30 @@ impl<'a, 's> Session<'a, 's> {
         let rules = self.rules;
         let topic = &rules.plans.topics[message.topic];
         let mut late = None;
-        for (group, (range, stamp_ns)) in topic.groups.iter().zip(rows) {
-            if range.is_empty() {
-                *self.not_in_message.entry(name.to_owned()).or_default() += 1;
-                continue;
-            }
-            let row = &values[range.clone()];
-            for (stream, columns) in &group.streams {
-                let rule = &rules.binding.streams[*stream].rule;
-                let StreamData::Vector(vector) = &rule.data else { continue };
-                let mut converted = std::mem::take(&mut self.scratch);
-                converted.clear();
-                converted.extend(row[columns.clone()].iter().map(|&value| vector.unit.apply(value)));
-                let is_encoded = matches!(rule.role, Role::State | Role::Action);
-                let is_float32 = is_encoded || rules.contract.written.float == FloatType::Float32;
-                if let Some(defect) = defect_of(&mut converted, vector.kind, (is_encoded, is_float32)) {
-                    if rule.non_finite == NonFiniteRule::Reject {
-                        self.scratch = converted;
-                        self.counts.lost(name, "non_finite", 1, || format!("offset {}", message.offset));
-                        return;
-                    }
-                    *self.non_finite.entry((*stream, defect)).or_default() += 1;
+        if rows.is_empty() && topic.has_vectors() {
+            *self.not_in_message.entry(name.to_owned()).or_default() += 1;
+        }
+        for (stream, stamp_ns, row) in topic.samples(rows, values) {
+            let rule = &rules.binding.streams[stream].rule;
+            let StreamData::Vector(vector) = &rule.data else { continue };
+            let mut converted = std::mem::take(&mut self.scratch);
+            converted.clear();
+            converted.extend(row.iter().map(|&value| vector.unit.apply(value)));
+            let is_encoded = matches!(rule.role, Role::State | Role::Action);
+            let is_float32 = is_encoded || rules.contract.written.float == FloatType::Float32;
+            if let Some(defect) = defect_of(&mut converted, vector.kind, (is_encoded, is_float32)) {
+                if rule.non_finite == NonFiniteRule::Reject {
+                    self.scratch = converted;
+                    self.counts.lost(name, "non_finite", 1, || format!("offset {}", message.offset));
+                    return;
                 }
-                let time = self.times(*stream, message, *stamp_ns);
-                if let Err(error) = self.aligner.push_values(*stream, time, &converted) {
-                    late = Some(error);
-                }
-                self.scratch = converted;
+                *self.non_finite.entry((stream, defect)).or_default() += 1;
             }
+            let time = self.times(stream, message, stamp_ns);
+            if let Err(error) = self.aligner.push_values(stream, time, &converted) {
+                late = Some(error);
+            }
+            self.scratch = converted;
         }
         if let Some(late) = late {
             self.count_late(name, message, late);
@@ -592,9 +588,9 @@ fn resets_of(messages: &[DecodedMessage], window_ns: i64, n_topics: usize) -> BT
 }
 
 impl Session<'_, '_> {
-    /// Returns the streams that rows wait for and that had no usable sample.
-    pub(crate) fn empty_streams(&self) -> Vec<usize> {
-        let required = |stream: &usize| self.rules.binding.streams[*stream].rule.gap != GapRule::Mask;
-        (0..self.samples.len()).filter(|&stream| self.samples[stream] == 0).filter(required).collect()
+    /// Returns the streams that had no usable sample: those that rows wait for, and those that they do not.
+    pub(crate) fn empty_streams(&self) -> (Vec<usize>, Vec<usize>) {
+        let is_required = |stream: &usize| self.rules.binding.streams[*stream].rule.gap != GapRule::Mask;
+        (0..self.samples.len()).filter(|&stream| self.samples[stream] == 0).partition(is_required)
     }
 }

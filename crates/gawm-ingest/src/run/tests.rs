@@ -1,107 +1,228 @@
-//! Contracts over small logs made here.
+//! Logs made here, through the contract to rows.
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use gawm_dataset::read::{Dataset, ReadLimits};
+use arrow::array::AsArray;
+use arrow::datatypes::Float64Type;
+use mcap::records::MessageHeader;
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
 use super::*;
 use crate::contract;
+use crate::suggest::{suggest, to_toml};
 
-/// A log that is being written.
-pub(crate) struct LogWriter {
-    writer: mcap::Writer<BufWriter<File>>,
-    channels: BTreeMap<String, u16>,
-    pub(crate) path: PathBuf,
+const MS: u64 = 1_000_000;
+const START: u64 = 1_760_000_000_000_000_000;
+
+/// One JSON message: topic, milliseconds since the start, text.
+type Sent = (&'static str, u64, String);
+
+fn write_log(path: &Path, messages: &[Sent]) {
+    let mut writer = mcap::Writer::new(BufWriter::new(std::fs::File::create(path).unwrap())).unwrap();
+    let mut sequences: BTreeMap<u16, u32> = BTreeMap::new();
+    for (topic, ms, text) in messages {
+        let channel_id = writer.add_channel(0, topic, "json", &BTreeMap::new()).unwrap();
+        let sequence = sequences.entry(channel_id).or_default();
+        *sequence += 1;
+        let log_time = START + ms * MS;
+        let header = MessageHeader { channel_id, sequence: *sequence, log_time, publish_time: log_time };
+        writer.write_to_known_channel(&header, text.as_bytes()).unwrap();
+    }
+    writer.finish().unwrap();
 }
 
-impl LogWriter {
-    pub(crate) fn new(folder: &Path) -> LogWriter {
-        let path = folder.join("log.mcap");
-        let writer = mcap::Writer::new(BufWriter::new(File::create(&path).unwrap())).unwrap();
-        LogWriter { writer, channels: BTreeMap::new(), path }
-    }
-
-    /// Adds a channel; `schema` is its name, encoding and text.
-    pub(crate) fn channel(&mut self, topic: &str, encoding: &str, schema: Option<(&str, &str, &str)>) {
-        let schema = schema.map_or(0, |(name, encoding, text)| {
-            self.writer.add_schema(name, encoding, text.as_bytes()).unwrap()
-        });
-        let id = self.writer.add_channel(schema, topic, encoding, &BTreeMap::new()).unwrap();
-        self.channels.insert(topic.to_owned(), id);
-    }
-
-    /// Writes a message; a topic that is new is one of JSON.
-    pub(crate) fn write(&mut self, topic: &str, time_ms: u64, payload: &[u8]) {
-        if !self.channels.contains_key(topic) {
-            self.channel(topic, "json", None);
+/// An arm of two joints every 10 ms and its gripper every 20 ms, 3 ms later, on one topic.
+fn two_publishers(more: &[Sent]) -> Vec<Sent> {
+    let mut sent: Vec<Sent> = Vec::new();
+    for i in 0..200 {
+        let value = |k: u64| i as f64 + k as f64 / 10.0;
+        sent.push((
+            "/joints",
+            10 * i,
+            format!(r#"{{"name":["b","a"],"position":[{},{}]}}"#, value(2), value(1)),
+        ));
+        if i % 2 == 0 {
+            sent.push(("/joints", 10 * i + 3, format!(r#"{{"name":["jaw"],"position":[{}]}}"#, value(3))));
         }
-        let time = 1_000_000_000 + time_ms * 1_000_000;
-        let header = mcap::records::MessageHeader {
-            channel_id: self.channels[topic],
-            sequence: time_ms as u32,
-            log_time: time,
-            publish_time: time,
-        };
-        self.writer.write_to_known_channel(&header, payload).unwrap();
     }
-
-    pub(crate) fn finish(mut self) -> PathBuf {
-        self.writer.finish().unwrap();
-        self.path
-    }
+    sent.extend(more.iter().cloned());
+    sent
 }
 
-pub(crate) fn run_over(text: &str, log: &Path, out: &Path, jobs: usize) -> Result<RunOutcome, RunError> {
-    let contract = contract::check(&contract::parse(text, "test.toml", &[]).unwrap(), "test.toml").unwrap();
+/// A contract of streams of `/joints`, each of the joints given, at 50 Hz.
+fn contract_of(streams: &[&[&str]], more: &str) -> contract::CheckedContract {
+    let mut text = "[ticks]\nrate_hz = 50\n".to_owned();
+    for (number, joints) in streams.iter().enumerate() {
+        let fields: Vec<String> =
+            joints.iter().map(|joint| format!("'position[name=\"{joint}\"]'")).collect();
+        text.push_str(&format!(
+            "[[stream]]\nname = \"s{number}\"\ntopic = \"/joints\"\nfields = [{}]\nfeature = \"observation.state\"\nclock = \"log\"\ntolerance_ms = 50\n{more}\n",
+            fields.join(", ")
+        ));
+    }
+    contract::check(&contract::parse(&text, "test.toml", &[]).unwrap(), "test.toml").unwrap()
+}
+
+fn run_of(
+    contract: &contract::CheckedContract,
+    log: &Path,
+    out: &Path,
+) -> (Result<RunOutcome, RunError>, Report) {
     let options = RunOptions {
-        contract: &contract,
+        contract,
         contract_folder: Path::new(""),
         out,
         logs: &[log.to_owned()],
         mode: WriteMode::New,
-        jobs,
+        jobs: 2,
         shard: None,
         interrupt: &AtomicBool::new(false),
         progress: &|_, _, _| {},
     };
-    run(&options, &mut Report::default())
+    let mut report = Report::default();
+    let outcome = run(&options, &mut report);
+    (outcome, report)
 }
 
-/// Returns a column of one value per row.
-fn scalars(out: &Path, name: &str) -> Vec<f64> {
-    let dataset = Dataset::open(out, ReadLimits::default()).unwrap();
-    let take = |rows: &gawm_dataset::read::EpisodeRows| rows.column(name).unwrap().dims()[0].clone();
-    let (columns, defects) = dataset.scan(&[name.to_owned()], |rows| take(&rows)).unwrap();
-    assert!(defects.is_empty(), "{defects:?}");
-    columns.into_iter().flatten().collect()
+/// The states of a dataset, row by row.
+fn states(out: &Path) -> Vec<Vec<f64>> {
+    let file = std::fs::File::open(out.join("data/chunk-000/file-000.parquet")).unwrap();
+    let reader = ParquetRecordBatchReaderBuilder::try_new(file).unwrap().build().unwrap();
+    let mut rows = Vec::new();
+    for batch in reader.map(Result::unwrap) {
+        let column = &batch["observation.state"];
+        for row in 0..batch.num_rows() {
+            let values = match (column.as_list_opt::<i32>(), column.as_fixed_size_list_opt()) {
+                (Some(list), _) => list.value(row),
+                (_, Some(list)) => list.value(row),
+                _ => column.slice(row, 1),
+            };
+            rows.push(values.as_primitive::<Float64Type>().values().to_vec());
+        }
+    }
+    rows
+}
+
+struct Made {
+    _folder: tempfile::TempDir,
+    log: PathBuf,
+    out: PathBuf,
+}
+
+fn made(messages: &[Sent]) -> Made {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, out) = (folder.path().join("log.mcap"), folder.path().join("out"));
+    write_log(&log, messages);
+    Made { log, out, _folder: folder }
+}
+
+fn check_rows_of_two_publishers(streams: &[&[&str]], names: &[&str]) {
+    let made = made(&two_publishers(&[]));
+    let (outcome, _) = run_of(&contract_of(streams, ""), &made.log, &made.out);
+    let outcome = outcome.unwrap();
+    assert_eq!(outcome.report.files[0].status, FileStatus::Ok, "{:#?}", outcome.report);
+    let topic = &outcome.report.files[0].topics[0];
+    assert_eq!((topic.read, topic.kept), (300, 300));
+    let gawm_schema::FeatureData::Vector { parts, .. } = &outcome.schema.features[0].data else { panic!() };
+    let dims: Vec<&str> = parts.iter().flat_map(|part| &part.dims).map(|dim| dim.name.as_str()).collect();
+    assert_eq!(dims, names);
+    // The first tick is at 3 ms, when the gripper has spoken; then every 20 ms.
+    for (row, values) in states(&made.out).iter().enumerate() {
+        let i = 2.0 * row as f64;
+        let expected = |name: &&str| match *name {
+            "a" => i + 0.1,
+            "b" => i + 0.2,
+            _ => i + 0.3,
+        };
+        assert_eq!(*values, names.iter().map(expected).collect::<Vec<f64>>(), "row {row}");
+    }
 }
 
 #[test]
-fn interventions_are_a_column_from_a_topic() {
-    let dir = tempfile::tempdir().unwrap();
-    let mut log = LogWriter::new(dir.path());
-    for i in 0..20 {
-        log.write("/state", i * 100, format!("{{\"x\": {i}}}").as_bytes());
-        // Said only when it changes, as a foot pedal does.
-        match i {
-            0 => log.write("/pedal", 0, b"{\"data\": false}"),
-            4 => log.write("/pedal", 430, b"{\"data\": true}"),
-            9 => log.write("/pedal", 970, b"{\"data\": false}"),
-            _ => {}
-        }
+fn joints_come_from_whichever_message_has_them() {
+    check_rows_of_two_publishers(&[&["a", "b", "jaw"]], &["a", "b", "jaw"]);
+    check_rows_of_two_publishers(&[&["jaw", "b"]], &["jaw", "b"]);
+    check_rows_of_two_publishers(&[&["a", "jaw", "b"]], &["a", "jaw", "b"]);
+    check_rows_of_two_publishers(&[&["a", "b"], &["jaw"]], &["a", "b", "jaw"]);
+}
+
+#[test]
+fn messages_without_any_mapped_joint_are_no_loss() {
+    let made = made(&two_publishers(&[]));
+    let (outcome, _) = run_of(&contract_of(&[&["a", "b"]], ""), &made.log, &made.out);
+    let outcome = outcome.unwrap();
+    assert_eq!(outcome.report.files[0].status, FileStatus::Ok, "{:#?}", outcome.report);
+    let warnings = outcome.report.warnings.join("\n");
+    assert!(warnings.contains("/joints: 100 messages hold none of the mapped elements"), "{warnings}");
+}
+
+#[test]
+fn messages_with_some_of_the_joints_of_a_publisher_are_lost() {
+    let partial = ("/joints", 1001, r#"{"name":["b"],"position":[7]}"#.to_owned());
+    let made = made(&two_publishers(&[partial]));
+    let (outcome, _) = run_of(&contract_of(&[&["a", "b"], &["jaw"]], ""), &made.log, &made.out);
+    let outcome = outcome.unwrap();
+    let topic = &outcome.report.files[0].topics[0];
+    assert_eq!((topic.read, topic.kept, topic.lost[0].reason.as_str()), (301, 300, "name_absent"));
+    assert!(topic.lost[0].first.contains("no \"a\" in this message, which has \"b\""), "{:?}", topic.lost);
+}
+
+#[test]
+fn a_joint_that_nobody_publishes_is_an_error_that_lists_those_that_are() {
+    let made = made(&two_publishers(&[]));
+    let (outcome, report) = run_of(&contract_of(&[&["a", "b"], &["elbow"]], ""), &made.log, &made.out);
+    assert!(matches!(outcome, Err(RunError::Nothing { .. })), "{outcome:?}");
+    let error = report.files[0].error.clone().unwrap();
+    assert!(error.contains("stream \"s1\"") && error.contains("which has \"b\", \"a\""), "{error}");
+}
+
+#[test]
+fn a_suggestion_gives_each_publisher_its_stream() {
+    let made = made(&two_publishers(&[]));
+    let suggestion =
+        suggest(std::slice::from_ref(&made.log), &SchemaLibrary::builtin(), &OpenOptions::default()).unwrap();
+    let joints: Vec<(Vec<String>, f64)> = suggestion
+        .contract
+        .stream
+        .iter()
+        .filter(|stream| stream.topic.is_some())
+        .map(|stream| (stream.fields.clone(), stream.tolerance_ms.unwrap_or_default()))
+        .collect();
+    let field = |joint: &str| format!("position[name=\"{joint}\"]");
+    assert_eq!(joints[0].0, [field("b"), field("a")]);
+    assert_eq!(joints[1].0, [field("jaw")]);
+    assert!((30.0..50.0).contains(&joints[0].1) && (55.0..80.0).contains(&joints[1].1), "{joints:?}");
+    let text = to_toml(&suggestion);
+    let contract = contract::check(&contract::parse(&text, "s.toml", &[]).unwrap(), "s.toml").unwrap();
+    let outcome = run_of(&contract, &made.log, &made.out).0.unwrap();
+    assert!(!outcome.has_loss() && outcome.report.episodes == 1, "{:#?}", outcome.report);
+}
+
+#[test]
+fn a_suggestion_takes_frames_that_move_where_nothing_else_says_how_the_robot_stands() {
+    let transform = |child: &str, x: f64| {
+        format!(
+            r#"{{"transforms":[{{"child_frame_id":"{child}","transform":{{"translation":{{"x":{x},"y":0.5,"z":0}},"rotation":{{"x":0,"y":0,"z":0,"w":1}}}}}}]}}"#
+        )
+    };
+    let mut sent: Vec<Sent> = vec![("/tf_static", 0, transform("laser", 0.2))];
+    for i in 0..100 {
+        sent.push(("/tf", 20 * i, transform("base", i as f64 / 100.0)));
+        sent.push(("/tf", 20 * i + 1, transform("mount", 0.1)));
+        sent.push(("/scan/temperature", 20 * i, format!(r#"{{"celsius":{}}}"#, 20 + i % 3)));
     }
-    let text = "version = 1\n[ticks]\nrate_hz = 10\n\
-        [[stream]]\ntopic = \"/state\"\nfields = [\"x\"]\nfeature = \"observation.state\"\ntolerance_ms = 150\n\
-        [[stream]]\ntopic = \"/pedal\"\nfields = [\"data\"]\nfeature = \"annotation.intervention\"\nkind = \"bool\"\nalign = \"hold\"\n";
-    let (path, out) = (log.finish(), dir.path().join("out"));
-    let outcome = run_over(text, &path, &out, 2).unwrap();
+    let made = made(&sent);
+    let suggestion =
+        suggest(std::slice::from_ref(&made.log), &SchemaLibrary::builtin(), &OpenOptions::default()).unwrap();
+    let text = to_toml(&suggestion);
+    let contract = contract::check(&contract::parse(&text, "s.toml", &[]).unwrap(), "s.toml").unwrap();
+    let outcome = run_of(&contract, &made.log, &made.out).0.unwrap();
     assert!(!outcome.has_loss(), "{:#?}", outcome.report);
-    let state = scalars(&out, "observation.state");
-    let expected: Vec<f64> = state.iter().map(|x| f64::from(u8::from((5.0..10.0).contains(x)))).collect();
-    assert_eq!(state.len(), 20);
-    assert_eq!(scalars(&out, "annotation.intervention"), expected);
+    let rows = states(&made.out);
+    assert_eq!(rows[10].len(), 7, "{text}");
+    assert_eq!(rows[10], [0.1, 0.5, 0.0, 0.0, 0.0, 0.0, 1.0]);
+    assert!(text.contains("\"base.qw\""), "{text}");
 }

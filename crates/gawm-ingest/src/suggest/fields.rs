@@ -1,5 +1,7 @@
 //! Which numbers of a message are columns, and what they are.
 
+use std::collections::BTreeSet;
+
 use serde_json::Value;
 
 use super::guess::Group;
@@ -58,6 +60,43 @@ pub(crate) fn joints(topic: &Topic, messages: &[Value], survey: &Survey) -> Opti
         (!names.is_empty()).then_some(names)
     };
     let all: Vec<Vec<String>> = messages.iter().filter_map(names_of).collect();
+    let publishers = by_publisher(&all);
+    let n_publishers = publishers.len();
+    let mut groups = Vec::new();
+    for names in publishers {
+        let share = names.len() as f64 / all.len() as f64;
+        for mut group in joints_of(&names, layout, survey)? {
+            if n_publishers > 1 {
+                group.share = share;
+                group.reason.push_str(&format!("; one of {n_publishers} publishers of this topic"));
+            }
+            groups.push(group);
+        }
+    }
+    (!groups.is_empty()).then_some(groups)
+}
+
+/// Shares out the names of messages by who published them: names that come in one message belong together.
+fn by_publisher(all: &[Vec<String>]) -> Vec<Vec<Vec<String>>> {
+    let mut publishers: Vec<(BTreeSet<&String>, Vec<Vec<String>>)> = Vec::new();
+    for names in all {
+        let mut own: (BTreeSet<&String>, Vec<Vec<String>>) = (names.iter().collect(), vec![names.clone()]);
+        let (same, others) =
+            publishers.into_iter().partition(|(known, _)| names.iter().any(|name| known.contains(name)));
+        publishers = others;
+        let same: Vec<(BTreeSet<&String>, Vec<Vec<String>>)> = same;
+        for (known, messages) in same.into_iter().rev() {
+            own.0.extend(known);
+            own.1.splice(0..0, messages);
+        }
+        publishers.push(own);
+    }
+    publishers.sort_by(|a, b| a.0.cmp(&b.0));
+    publishers.into_iter().map(|(_, messages)| messages).collect()
+}
+
+/// The joints of one publisher.
+fn joints_of(all: &[Vec<String>], layout: JointLayout<'_>, survey: &Survey) -> Option<Vec<Group>> {
     // Now and then a message has some of the joints only.
     let longest = all.iter().map(Vec::len).max()?;
     let first = all.iter().find(|names| names.len() == longest)?;
@@ -119,6 +158,9 @@ pub(crate) fn joints(topic: &Topic, messages: &[Value], survey: &Survey) -> Opti
                 limits: limits.into_iter().collect(),
                 reason: reason.to_owned(),
                 is_joints: true,
+                share: 1.0,
+                names: Vec::new(),
+                is_stamped: false,
             }),
         }
     }
@@ -134,6 +176,7 @@ pub(crate) fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
         .iter()
         .filter(|field| field.scalar.is_some_and(|scalar| scalar != Scalar::Text))
         .filter(|field| !names::is_bookkeeping(&field.path))
+        .filter(|field| !names::is_setting(topic.type_name(), &field.path))
         .collect();
     let mut at = 0;
     while at < fields.len() {
@@ -150,6 +193,9 @@ pub(crate) fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
                 limits: Vec::new(),
                 reason: format!("four numbers named x, y, z, w: a quaternion in {order} order"),
                 is_joints: false,
+                share: 1.0,
+                names: Vec::new(),
+                is_stamped: false,
             });
             width += 4;
             continue;
@@ -161,7 +207,10 @@ pub(crate) fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
         if width > MAX_WIDTH {
             break;
         }
-        let (kind, unit, reason) = kind_of(topic, field);
+        let (kind, unit, reason) = match quaternion_array(&path, n, messages) {
+            Some(reason) => (KindSpec::Quaternion, None, reason),
+            None => kind_of(topic, field),
+        };
         match groups
             .last_mut()
             .filter(|group| group.kind == kind && group.unit == unit && group.reason == reason)
@@ -174,6 +223,9 @@ pub(crate) fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
                 limits: Vec::new(),
                 reason,
                 is_joints: false,
+                share: 1.0,
+                names: Vec::new(),
+                is_stamped: false,
             }),
         }
     }
@@ -223,6 +275,61 @@ fn quaternion_at(fields: &[&FieldInfo]) -> Option<(&'static str, Vec<String>)> {
     Some((order, four.iter().map(|field| field.path.clone()).collect()))
 }
 
+/// Returns why four numbers in an array are a quaternion, if they are.
+fn quaternion_array(path: &str, n: usize, messages: &[Value]) -> Option<String> {
+    let base = path.strip_suffix("[0:4]").filter(|_| n == 4)?;
+    let last = base.rsplit('.').next().unwrap_or(base);
+    let is_named = names::words(last)
+        .iter()
+        .any(|word| matches!(word.as_str(), "quat" | "quaternion" | "orientation" | "rotation"));
+    let norm = |message: &Value| -> Option<f64> {
+        let items = crate::episodes::value_at(message, base)?;
+        let numbers: Option<Vec<f64>> = items.as_array()?.iter().map(Value::as_f64).collect();
+        Some(numbers?.iter().map(|value| value * value).sum::<f64>().sqrt())
+    };
+    let unit = messages.iter().filter_map(norm).filter(|norm| (norm - 1.0).abs() < 0.01).count();
+    (is_named && is_most(unit, messages.len())).then(|| {
+        "four numbers of length 1 named as a quaternion; that their order is x, y, z, w is a guess".to_owned()
+    })
+}
+
+/// Returns the number of values that most messages have in an array.
+fn usual_length(messages: &[Value], length_in: impl Fn(&Value) -> Option<usize>) -> Option<usize> {
+    let lengths: Vec<Option<usize>> = messages.iter().map(length_in).collect();
+    let count = |n: usize| lengths.iter().filter(|other| **other == Some(n)).count();
+    let n = lengths.iter().flatten().copied().max_by_key(|n| count(*n))?;
+    (n > 0 && n <= MAX_WIDTH && is_most(count(n), lengths.len())).then_some(n)
+}
+
+/// Returns the path of a value in the structs of an array, or of an array in the only one of them.
+fn path_in_structs(field: &FieldInfo, messages: &[Value]) -> Option<(String, usize)> {
+    let (list, member) = field.path.split_once("[].")?;
+    if member.contains("[].") || field.owner.ends_with("Quaternion") {
+        return None;
+    }
+    let items = |message: &Value| -> Option<Vec<Value>> {
+        crate::episodes::value_at(message, list)?.as_array().cloned()
+    };
+    let Some(inner) = member.strip_suffix("[]") else {
+        let n = usual_length(messages, |message| {
+            let items = items(message)?;
+            let is_whole = |item| is_number(crate::episodes::value_at(item, member).as_ref());
+            items.iter().all(is_whole).then_some(items.len())
+        })?;
+        return Some((format!("{list}[0:{n}].{member}"), n));
+    };
+    // A trajectory of one point is a command of that point.
+    let n = usual_length(messages, |message| match items(message)?.as_slice() {
+        [only] => {
+            let values = crate::episodes::value_at(only, inner)?;
+            let values = values.as_array()?;
+            values.iter().all(|value| is_number(Some(value))).then_some(values.len())
+        }
+        _ => None,
+    })?;
+    Some((format!("{list}[0].{inner}[0:{n}]"), n))
+}
+
 /// Returns the path of a leaf that every message has, arrays of equal length as slices, and its number of values.
 fn fixed_path(field: &FieldInfo, messages: &[Value]) -> Option<(String, usize)> {
     match field.arrays.as_slice() {
@@ -259,7 +366,7 @@ fn fixed_path(field: &FieldInfo, messages: &[Value]) -> Option<(String, usize)> 
             (*n > 0 && *n <= MAX_WIDTH && is_most(same, lengths.len()) && is_most(finite, lengths.len()))
                 .then(|| (format!("{base}[0:{n}]"), *n))
         }
-        _ => None,
+        _ => path_in_structs(field, messages),
     }
 }
 
@@ -351,5 +458,15 @@ fn json_in_text(topic: &Topic, messages: &[Value]) -> Option<Group> {
     }
     let reason = "numbers of the JSON that the text holds".to_owned();
     let kind = if names::is_gripper(&topic.channel.topic) { KindSpec::Gripper } else { KindSpec::Linear };
-    Some(Group { fields, kind, unit: None, limits: Vec::new(), reason, is_joints: false })
+    Some(Group {
+        fields,
+        kind,
+        unit: None,
+        limits: Vec::new(),
+        reason,
+        is_joints: false,
+        share: 1.0,
+        names: Vec::new(),
+        is_stamped: false,
+    })
 }

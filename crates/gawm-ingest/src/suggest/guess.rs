@@ -6,6 +6,7 @@ use serde_json::Value;
 use super::clock::{clock_of, tolerance_of};
 use super::fields::{joints, numbers};
 use super::survey::{Survey, Topic};
+use super::transforms::transforms;
 use super::{Suggestion, names};
 use crate::contract::{
     ActionSpec, ActionTimingSpec, AlignSpec, Contract, DeltaFrame, DerivedSpec, GapRule, ImageSpec, KindSpec,
@@ -42,6 +43,12 @@ pub(crate) struct Group {
     pub(crate) reason: String,
     /// Whether they are positions of named joints.
     pub(crate) is_joints: bool,
+    /// The part of the topic's messages that hold them, where several publishers share it; else 1.
+    pub(crate) share: f64,
+    /// Names of its values, where paths give poor ones.
+    pub(crate) names: Vec<String>,
+    /// Whether elements of the message have stamps of their own.
+    pub(crate) is_stamped: bool,
 }
 
 /// Guesses streams, clocks, tolerances and the rate.
@@ -62,6 +69,7 @@ pub(crate) fn guess(survey: &Survey, library: &SchemaLibrary) -> Suggestion {
             }
         }
     }
+    use_transforms(&mut found, library);
     for (topic, guess) in &found {
         if let Guess::Skip(reason) = guess {
             suggestion.unmapped.push(format!("{} ({}): {reason}", topic.channel.topic, shown_type(topic)));
@@ -76,7 +84,7 @@ pub(crate) fn guess(survey: &Survey, library: &SchemaLibrary) -> Suggestion {
         }
     }
     add_derived(&mut suggestion);
-    set_rate(&mut suggestion, survey);
+    set_rate(&mut suggestion, survey, &found);
     set_window(&mut suggestion, survey);
     suggestion
 }
@@ -84,6 +92,32 @@ pub(crate) fn guess(survey: &Survey, library: &SchemaLibrary) -> Suggestion {
 fn shown_type(topic: &Topic) -> String {
     let name = topic.type_name();
     if name.is_empty() { format!("{}, no schema", topic.channel.message_encoding) } else { name.to_owned() }
+}
+
+/// Where nothing says how the robot stands, the frames that move do.
+fn use_transforms(found: &mut [(&Topic, Guess)], library: &SchemaLibrary) {
+    let is_pose = |group: &Group| group.is_joints || group.kind == KindSpec::Quaternion;
+    let says = |(topic, guess): &(&Topic, Guess)| match guess {
+        Guess::Vectors(groups) => {
+            !names::is_side_reading(&topic.channel.topic, topic.type_name())
+                && command_split(topic, groups).0.iter().any(is_pose)
+        }
+        _ => false,
+    };
+    if found.iter().any(says) {
+        return;
+    }
+    for (topic, guess) in found {
+        let is_static = topic.channel.topic.ends_with("static");
+        if is_static || topic.messages < 2 || topic.report.obstacle.is_some() {
+            continue;
+        }
+        let decode = |sample: &bytes::Bytes| decode_to_json(&schema_of(&topic.channel), sample, library).ok();
+        let messages: Vec<Value> = topic.samples.iter().filter_map(decode).collect();
+        if let Some(groups) = transforms(topic, &messages) {
+            *guess = Guess::Vectors(groups);
+        }
+    }
 }
 
 fn guess_topic(topic: &Topic, survey: &Survey, library: &SchemaLibrary) -> Guess {
@@ -223,7 +257,21 @@ fn add_groups(
 ) {
     for group in groups {
         let (mut stream, mut reasons) = base_stream(topic, feature, role);
+        if group.share < 1.0
+            && let Some(rate_hz) = publisher_rate_hz(topic, group)
+        {
+            let tolerance_ms = (3e3 / rate_hz).max(20.0).ceil();
+            (stream.tolerance_ms, stream.align) = (Some(tolerance_ms), Some(AlignSpec::Asof));
+            reasons.pop();
+            reasons.push(format!("tolerance: about {rate_hz:.1} Hz from its publisher"));
+        }
+        if group.is_stamped {
+            "stamp".clone_into(&mut stream.clock);
+            reasons.retain(|reason| !reason.starts_with("clock: "));
+            reasons.push("clock: the stamps of the elements, close to the log times".to_owned());
+        }
         stream.fields.clone_from(&group.fields);
+        stream.names.clone_from(&group.names);
         stream.kind = group.kind;
         stream.unit.clone_from(&group.unit);
         stream.limits.clone_from(&group.limits);
@@ -244,15 +292,21 @@ fn add_groups(
     }
 }
 
+/// Returns the rate of a publisher that shares its topic with others, if all of them are steady.
+fn publisher_rate_hz(topic: &Topic, group: &Group) -> Option<f64> {
+    let span_s = (topic.report.end_ns? as f64 - topic.report.start_ns? as f64) / 1e9;
+    let own = topic.report.messages as f64 * group.share;
+    let rate_hz = (own - 1.0) / span_s;
+    (own >= 8.0 && rate_hz > 0.0 && topic.slow_ms <= 8e3 / rate_hz).then_some(rate_hz)
+}
+
 pub(crate) fn action_rule(timing: ActionTimingSpec) -> ActionSpec {
     ActionSpec { timing, n: None, reduce: None, delta_frame: DeltaFrame::Base, from: None, derived: None }
 }
 
 /// Returns whether a topic, or some of its fields, are commands.
 fn command_split(topic: &Topic, groups: &[Group]) -> (Vec<Group>, Vec<Group>) {
-    if names::is_command(&topic.channel.topic)
-        || names::is_command(topic.type_name().rsplit(['/', '.']).next().unwrap_or(""))
-    {
+    if names::is_command(&topic.channel.topic) || names::is_command_type(topic.type_name()) {
         return (Vec::new(), groups.to_vec());
     }
     let (mut states, mut commands) = (Vec::new(), Vec::new());
@@ -284,6 +338,8 @@ fn add_states(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Gu
         names::is_gripper(&topic.channel.topic) && groups.iter().any(|group| group.kind == KindSpec::Gripper)
     };
     let has_joints = measured.iter().any(|(_, groups)| is_joints(groups));
+    let is_side = |topic: &Topic| names::is_side_reading(&topic.channel.topic, topic.type_name());
+    let has_more = measured.iter().any(|(topic, groups)| !is_side(topic) && !is_marker(groups, topic));
     let extra_span = 0.5 * (survey.span_ns.1 - survey.span_ns.0) as f64;
     let mut has_state = false;
     for (topic, groups) in &measured {
@@ -299,6 +355,9 @@ fn add_states(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Gu
                 (Some(()), "a gripper belongs to the state of the arm")
             }
             () if has_joints => (None, "beside the joint states: carried along, not a target"),
+            () if has_more && is_side(topic) => {
+                (None, "a reading of its surroundings or its supply: carried along, not a target")
+            }
             () => (Some(()), "no joint states in this log: every number that is measured is state"),
         };
         let covers = (topic.span_ns.1 - topic.span_ns.0) as f64 >= extra_span;
@@ -461,9 +520,18 @@ fn add_derived(suggestion: &mut Suggestion) {
     ]);
 }
 
-fn set_rate(suggestion: &mut Suggestion, survey: &Survey) {
+fn set_rate(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Guess)]) {
     let rate_of = |stream: &StreamSpec| {
         let topic = survey.topics.get(stream.topic.as_deref()?)?;
+        let own = found.iter().filter(|(other, _)| other.channel.topic == topic.channel.topic);
+        let groups = own.filter_map(|(_, guess)| match guess {
+            Guess::Vectors(groups) => Some(groups),
+            _ => None,
+        });
+        let shared = groups.flatten().find(|group| group.share < 1.0 && group.fields == stream.fields);
+        if let Some(group) = shared {
+            return publisher_rate_hz(topic, group);
+        }
         (topic.rate_hz() > 0.0 && stream.tolerance_ms.is_some()).then(|| topic.rate_hz())
     };
     let is_depth = |stream: &StreamSpec| stream.feature.contains("depth");
@@ -494,7 +562,9 @@ fn set_rate(suggestion: &mut Suggestion, survey: &Survey) {
         }
     }
     // Integers are what LeRobot stores: a usual rate or the nearest where it is within 5 %, else the next below.
-    let usual = USUAL_RATES_HZ.into_iter().find(|usual| (usual / rate - 1.0).abs() <= 0.05);
+    let distance = |usual: &f64| (usual / rate - 1.0).abs();
+    let nearest = USUAL_RATES_HZ.into_iter().min_by(|a, b| distance(a).total_cmp(&distance(b)));
+    let usual = nearest.filter(|usual| distance(usual) <= 0.05);
     let near = (rate.round() / rate - 1.0).abs() <= 0.05;
     let rounded = usual.unwrap_or(if near { rate.round() } else { rate.floor() });
     let (rate_hz, fps) =

@@ -38,18 +38,14 @@ pub(crate) type StreamSeries = BTreeMap<usize, Vec<Series>>;
 fn remove_unbindable(suggestion: &mut Suggestion, survey: &Survey, library: &SchemaLibrary) {
     for _ in 0..suggestion.contract.stream.len() {
         let Ok(checked) = check(&suggestion.contract, "suggestion") else { return };
-        let at = match Binding::new(&checked, &survey.first.name, &survey.first.channels, library) {
+        let text = match Binding::new(&checked, &survey.first.name, &survey.first.channels, library) {
             Ok(_) => return,
-            Err(BindError::Run(error)) => {
-                let text = error.to_string();
-                let found = checked.streams.iter().position(|stream| {
-                    stream.name.as_ref().is_some_and(|name| text.contains(&format!("{name:?}")))
-                });
-                found.map(|at| (at, text))
-            }
-            Err(BindError::Refused(refusal)) => Some((0, refusal.to_string())),
+            Err(BindError::Run(error)) => error.to_string(),
+            Err(BindError::Refused(refusal)) => refusal.to_string(),
         };
-        let Some((at, text)) = at else { return };
+        let is_named =
+            |name: &Option<String>| name.as_ref().is_some_and(|name| text.contains(&format!("{name:?}")));
+        let Some(at) = checked.streams.iter().position(|stream| is_named(&stream.name)) else { return };
         let stream = suggestion.contract.stream.remove(at);
         suggestion.stream_reasons.remove(at);
         suggestion.unmapped.push(format!("{}: {text}", stream.topic.unwrap_or_default()));
@@ -64,29 +60,23 @@ fn read(suggestion: &Suggestion, survey: &Survey, library: &SchemaLibrary) -> Op
     let mut all: StreamSeries = BTreeMap::new();
     let _: ControlFlow<()> = survey.first.read(&plans, 1, |_, block| {
         for message in block.messages.iter().filter(|message| message.loss().is_none()) {
-            let rows = message.rows(&block.rows);
-            for (group, (range, stamp_ns)) in plans.topics[message.topic].groups.iter().zip(rows) {
-                if range.is_empty() {
+            let topic = &plans.topics[message.topic];
+            for (stream, stamp_ns, values) in topic.samples(message.rows(&block.rows), &block.values) {
+                let bound = &binding.streams[stream];
+                let series =
+                    all.entry(bound.rule.index).or_insert_with(|| vec![Series::default(); values.len()]);
+                let ns = match bound.rule.clock {
+                    Clock::Log => message.log_ns,
+                    Clock::Publish => message.publish_ns,
+                    _ => stamp_ns.unwrap_or(message.publish_ns),
+                };
+                let is_next = series[0].times_ns.last().is_none_or(|&last| ns > last);
+                if !is_next || series[0].times_ns.len() >= MAX_SAMPLES {
                     continue;
                 }
-                for (stream, columns) in &group.streams {
-                    let bound = &binding.streams[*stream];
-                    let series =
-                        all.entry(bound.rule.index).or_insert_with(|| vec![Series::default(); columns.len()]);
-                    let ns = match bound.rule.clock {
-                        Clock::Log => message.log_ns,
-                        Clock::Publish => message.publish_ns,
-                        _ => stamp_ns.unwrap_or(message.publish_ns),
-                    };
-                    let is_next = series[0].times_ns.last().is_none_or(|&last| ns > last);
-                    if !is_next || series[0].times_ns.len() >= MAX_SAMPLES {
-                        continue;
-                    }
-                    let values = &block.values[range.clone()][columns.clone()];
-                    for (series, &value) in series.iter_mut().zip(values) {
-                        series.times_ns.push(ns);
-                        series.values.push(value);
-                    }
+                for (series, &value) in series.iter_mut().zip(values) {
+                    series.times_ns.push(ns);
+                    series.values.push(value);
                 }
             }
         }

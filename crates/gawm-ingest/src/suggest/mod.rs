@@ -15,6 +15,7 @@ mod render;
 mod rows;
 mod stream_names;
 mod survey;
+mod transforms;
 mod urdf;
 
 use std::path::PathBuf;

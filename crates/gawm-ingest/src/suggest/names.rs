@@ -48,6 +48,13 @@ pub(crate) fn is_command(name: &str) -> bool {
     has(name, &COMMAND)
 }
 
+/// Types that are sent to make a robot move.
+pub(crate) fn is_command_type(type_name: &str) -> bool {
+    let bare = type_name.rsplit(['/', '.']).next().unwrap_or("");
+    is_command(bare)
+        || matches!(bare, "JointTrajectory" | "JointJog" | "AckermannDrive" | "AckermannDriveStamped")
+}
+
 pub(crate) fn is_gripper(name: &str) -> bool {
     has(name, &["gripper", "grippers", "finger", "fingers", "grip", "jaw", "hand"])
 }
@@ -88,8 +95,40 @@ pub(crate) fn is_housekeeping(topic: &str, type_name: &str) -> bool {
             | "CameraCalibration"
             | "Clock"
             | "Statistics"
+            | "Marker"
+            | "MarkerArray"
+            | "SceneUpdate"
+            | "OccupancyGrid"
+            | "PointCloud"
+            | "PointCloud2"
     ) || topic.ends_with("/clock")
         || matches!(topic, "/rosout" | "/rosout_agg" | "/parameter_events" | "/tf" | "/tf_static")
+}
+
+/// Readings that say little of where the robot is: of what is around it, of its battery.
+pub(crate) fn is_side_reading(topic: &str, type_name: &str) -> bool {
+    let bare = type_name.rsplit(['/', '.']).next().unwrap_or("");
+    matches!(
+        bare,
+        "LaserScan"
+            | "MultiEchoLaserScan"
+            | "Range"
+            | "BatteryState"
+            | "Temperature"
+            | "FluidPressure"
+            | "RelativeHumidity"
+            | "Illuminance"
+    ) || has(topic, &["battery", "temperature", "diagnostics"])
+}
+
+/// Settings of a sensor that are sent with every reading.
+pub(crate) fn is_setting(type_name: &str, path: &str) -> bool {
+    let bare = type_name.rsplit(['/', '.']).next().unwrap_or("");
+    match bare {
+        "LaserScan" => !path.starts_with("ranges") && !path.starts_with("intensities"),
+        "Range" => path != "range",
+        _ => false,
+    }
 }
 
 /// Times, counters and labels within a message are no measurements.
@@ -114,6 +153,8 @@ pub(crate) fn is_bookkeeping(path: &str) -> bool {
                 | "id"
                 | "index"
                 | "frame_id"
+                | "type_mask"
+                | "coordinate_frame"
                 | "counter"
                 | "sequenceNumber"
                 | "sequence_number"

@@ -197,7 +197,8 @@ fn add_report(seen: &mut BTreeMap<String, Topic>, report: ChannelReport, open: &
     }
 }
 
-/// Keeps some payloads of each topic, spread over the recording: of n messages every n/[`SAMPLES`]-th.
+/// Keeps some payloads of each topic, spread over the recording: of n messages one in each n/[`SAMPLES`], at another place
+/// each time, so that publishers who take turns are all met.
 fn collect_samples(open: &OpenRecording, topics: &mut BTreeMap<String, Topic>, library: &SchemaLibrary) {
     let mut counts: BTreeMap<String, u64> = BTreeMap::new();
     for (part, block) in &open.blocks {
@@ -207,7 +208,8 @@ fn collect_samples(open: &OpenRecording, topics: &mut BTreeMap<String, Topic>, l
             let Some(topic) = topics.get_mut(&channel.topic) else { continue };
             let count = counts.entry(channel.topic.clone()).or_default();
             let every = (topic.messages / SAMPLES as u64).max(1);
-            let is_wanted = count.is_multiple_of(every) && topic.samples.len() < SAMPLES;
+            let taken = topic.samples.len() as u64;
+            let is_wanted = *count == taken * every + taken % every && topic.samples.len() < SAMPLES;
             *count += 1;
             let payload = unpacked(channel, block.payload(message));
             if is_wanted && (payload.len() < LARGE_BYTES || topic.samples.len() < 2) {

@@ -8,7 +8,7 @@ use gawm_dataset::read::{Dataset, FrameBytes, ReadLimits};
 
 use super::tests::{fixture, number_of, packets};
 use crate::rows::{push_bytes, push_header, push_text};
-use crate::run::tests::{LogWriter, run_over};
+use crate::run::made_logs::{LogWriter, run_over};
 use crate::run::{FileStatus, RunOutcome};
 
 const CAMERA: &str = "observation.images.cam";

@@ -87,7 +87,9 @@ impl Rollout {
             [n * frames * latent, n * chunks * action, n * steps * latent],
             "rollout: sizes of latents, actions and output"
         );
-        let group = n.div_ceil(rayon::current_num_threads()).clamp(1, GROUP);
+        // As many groups for every thread, and all of about one size.
+        let groups = n.div_ceil(GROUP).max(1).next_multiple_of(rayon::current_num_threads());
+        let group = n.div_ceil(groups).max(1);
         let inputs = z.par_chunks(group * frames * latent).zip(actions.par_chunks(group * chunks * action));
         output.par_chunks_mut(group * steps * latent).zip(inputs).for_each(|(output, (z, actions))| {
             let taken = self.scratches.lock().unwrap_or_else(std::sync::PoisonError::into_inner).pop();

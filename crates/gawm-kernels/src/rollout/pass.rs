@@ -1,8 +1,8 @@
 //! The roll-out of a group of sequences on one thread.
 
 use super::RolloutShape;
-use super::weights::{Block, Linear, Norm, Packs};
-use crate::gelu::gelu;
+use super::weights::{Block, Heads, Linear, Mlp, Norm, Packs};
+use crate::gelu::gelu_in_place;
 use crate::gemm::{Epilogue, Lhs, Rhs, gemm};
 use crate::norm;
 use crate::profile::{Kind, span};
@@ -17,9 +17,9 @@ pub(super) struct Scratch {
     embedded: Vec<f32>,
     /// Of each block, [n, chunks, 6 latent]: shift, scale, gate of attention, then of the MLP.
     modulations: Vec<Vec<f32>>,
-    /// Of each block, [n, history, inner].
-    keys: Vec<Vec<f32>>,
-    values: Vec<Vec<f32>>,
+    /// Of each block and group of heads, [n, history, columns of the group].
+    keys: Vec<Vec<Vec<f32>>>,
+    values: Vec<Vec<Vec<f32>>>,
     x: Vec<f32>,
     y: Vec<f32>,
     z: Vec<f32>,
@@ -27,6 +27,7 @@ pub(super) struct Scratch {
     hidden: Vec<f32>,
     q: Vec<f32>,
     fresh: Vec<f32>,
+    added: Vec<f32>,
 }
 
 /// Returns the first `count` elements, growing the vector where it is shorter.
@@ -93,15 +94,18 @@ impl Pass<'_> {
         linear(c, hidden, [rows, c.inputs], embedded, false);
         silu(embedded);
         let n_blocks = self.packs.blocks.len();
-        for vectors in [&mut scratch.modulations, &mut scratch.keys, &mut scratch.values] {
-            vectors.resize_with(n_blocks, Vec::new);
+        scratch.modulations.resize_with(n_blocks, Vec::new);
+        for caches in [&mut scratch.keys, &mut scratch.values] {
+            caches.resize_with(n_blocks, Vec::new);
         }
-        let inner = self.shape.heads * self.shape.head_width;
         for (index, block) in self.packs.blocks.iter().enumerate() {
             let modulation = sized(&mut scratch.modulations[index], rows * block.modulation.outputs);
             linear(&block.modulation, embedded, [rows, block.modulation.inputs], modulation, false);
-            for cache in [&mut scratch.keys[index], &mut scratch.values[index]] {
-                sized(cache, self.n * self.shape.history * inner);
+            for caches in [&mut scratch.keys[index], &mut scratch.values[index]] {
+                caches.resize_with(block.heads.len(), Vec::new);
+                for (cache, heads) in caches.iter_mut().zip(&block.heads) {
+                    sized(cache, self.n * self.shape.history * heads.k.outputs);
+                }
             }
         }
     }
@@ -125,31 +129,13 @@ impl Pass<'_> {
 
     /// One block; of its output only the last `kept` tokens of each sequence, which is all of them or one.
     fn block(&self, index: usize, block: &Block, tokens: Tokens, kept: usize, scratch: &mut Scratch) {
-        let RolloutShape { latent: d, heads, head_width, history, .. } = *self.shape;
-        let (n, inner, count) = (self.n, heads * head_width, tokens.count);
+        let (d, n, count) = (self.shape.latent, self.n, tokens.count);
         let y = sized(&mut scratch.y, n * count * d);
         self.modulated_norm(&scratch.x, &scratch.modulations[index], (tokens, count), 0, &block.attn_norm, y);
-        for (layer, cache) in [(&block.k, &mut scratch.keys[index]), (&block.v, &mut scratch.values[index])] {
-            let fresh = sized(&mut scratch.fresh, n * count * inner);
-            linear(layer, y, [n * count, d], fresh, false);
-            let caches = cache.chunks_exact_mut(history * inner);
-            for (cache, fresh) in caches.zip(fresh.chunks_exact(count * inner)) {
-                cache[tokens.first * inner..][..fresh.len()].copy_from_slice(fresh);
-            }
+        sized(&mut scratch.added, n * kept * d);
+        for (group, heads) in block.heads.iter().enumerate() {
+            self.attend([index, group], heads, tokens, kept, scratch);
         }
-        let q = sized(&mut scratch.q, n * kept * inner);
-        linear(&block.q, &y[(count - kept) * d..], [n * kept, d * (count / kept)], q, false);
-        let attended = sized(&mut scratch.z, n * kept * inner);
-        let scores = sized(&mut scratch.rstd, history);
-        span(Kind::AttentionForward, 0, || {
-            for row in 0..n * kept {
-                let (sequence, seen) = (row / kept, tokens.first + count - kept + row % kept + 1);
-                let cache = sequence * history * inner..(sequence * history + seen) * inner;
-                let (keys, values) = (&scratch.keys[index][cache.clone()], &scratch.values[index][cache]);
-                let output = &mut attended[row * inner..][..inner];
-                attend(&q[row * inner..][..inner], keys, values, head_width, scores, output);
-            }
-        });
         if kept < count {
             for sequence in 0..n {
                 let from = (sequence * count + count - 1) * d;
@@ -158,30 +144,66 @@ impl Pass<'_> {
         }
         let x = &mut scratch.x[..n * kept * d];
         let y = &mut scratch.y[..n * kept * d];
-        linear(&block.output, attended, [n * kept, inner], y, false);
-        self.add_gated(y, &scratch.modulations[index], (tokens, kept), 2, x);
+        self.add_gated(&scratch.added[..n * kept * d], &scratch.modulations[index], (tokens, kept), 2, x);
         self.modulated_norm(x, &scratch.modulations[index], (tokens, kept), 3, &block.mlp_norm, y);
-        let hidden = sized(&mut scratch.hidden, n * kept * block.expand.outputs);
-        let activated = sized(&mut scratch.fresh, n * kept * block.expand.outputs);
-        linear(&block.expand, y, [n * kept, d], hidden, false);
-        span(Kind::Gelu, 0, || gelu(hidden, activated));
-        linear(&block.contract, activated, [n * kept, block.expand.outputs], y, false);
+        mlp(&block.mlp, y, n * kept, &mut scratch.hidden, &mut scratch.z);
+        let y = &scratch.z[..n * kept * d];
         self.add_gated(y, &scratch.modulations[index], (tokens, kept), 5, x);
+    }
+
+    /// Adds what a group of heads reads for the last `kept` tokens of each sequence; the first group overwrites.
+    fn attend(
+        &self,
+        [block, group]: [usize; 2],
+        heads: &Heads,
+        tokens: Tokens,
+        kept: usize,
+        scratch: &mut Scratch,
+    ) {
+        let RolloutShape { latent: d, head_width, history, .. } = *self.shape;
+        let (n, count, inner) = (self.n, tokens.count, heads.q.outputs);
+        let y = &scratch.y[..n * count * d];
+        let (keys, values) = (&mut scratch.keys[block][group], &mut scratch.values[block][group]);
+        for (layer, cache) in [(&heads.k, &mut *keys), (&heads.v, &mut *values)] {
+            // Rows of equal distance go straight to their places.
+            if count == 1 || count == history {
+                let stride = if count == 1 { history * inner } else { inner };
+                linear_to(layer, y, [n * count, d], &mut cache[tokens.first * inner..], stride, false);
+                continue;
+            }
+            let fresh = sized(&mut scratch.fresh, n * count * inner);
+            linear(layer, y, [n * count, d], fresh, false);
+            let caches = cache.chunks_exact_mut(history * inner);
+            for (cache, fresh) in caches.zip(fresh.chunks_exact(count * inner)) {
+                cache[tokens.first * inner..][..fresh.len()].copy_from_slice(fresh);
+            }
+        }
+        let q = sized(&mut scratch.q, n * kept * inner);
+        linear(&heads.q, &y[(count - kept) * d..], [n * kept, d * (count / kept)], q, false);
+        let attended = sized(&mut scratch.z, n * kept * inner);
+        let scores = sized(&mut scratch.rstd, (history + 1) * inner / head_width);
+        span(Kind::AttentionForward, 0, || {
+            for row in 0..n * kept {
+                let (sequence, seen) = (row / kept, tokens.first + count - kept + row % kept + 1);
+                let cache = sequence * history * inner..(sequence * history + seen) * inner;
+                let output = &mut attended[row * inner..][..inner];
+                let q = &q[row * inner..][..inner];
+                attend(q, &keys[cache.clone()], &values[cache], head_width, scores, output);
+            }
+        });
+        let added = &mut scratch.added[..n * kept * d];
+        linear(&heads.output, attended, [n * kept, inner], added, group > 0);
     }
 
     /// Maps the last token of each sequence to the next latent.
     fn project(&self, tokens: Tokens, scratch: &mut Scratch) {
         let (d, n) = (self.shape.latent, self.n);
-        let hidden_width = self.packs.project.outputs;
         let (x, y) = (&scratch.x[..n * d], sized(&mut scratch.y, n * d));
         let (normal, rstd) = (sized(&mut scratch.z, n * d), sized(&mut scratch.rstd, n));
         norm::normalize(x, d, self.shape.affine_epsilon, normal, rstd);
         norm::scale_shift(normal, &self.packs.norm.weight, &self.packs.norm.bias, y);
-        let hidden = sized(&mut scratch.hidden, n * hidden_width);
-        let activated = sized(&mut scratch.fresh, n * hidden_width);
-        linear(&self.packs.project, y, [n, d], hidden, false);
-        span(Kind::Gelu, 0, || gelu(hidden, activated));
-        linear(&self.packs.finish, activated, [n, hidden_width], y, false);
+        mlp(&self.packs.project, y, n, &mut scratch.hidden, &mut scratch.z);
+        let y = &scratch.z[..n * self.packs.project.outputs];
         let next = (tokens.start + tokens.first + tokens.count) * d;
         for (latents, y) in scratch.latents.chunks_exact_mut((self.chunks + 1) * d).zip(y.chunks_exact(d)) {
             latents[next..next + d].copy_from_slice(y);
@@ -227,30 +249,52 @@ impl Pass<'_> {
         let d = self.shape.latent;
         for (row, (x, y)) in x.chunks_exact_mut(d).zip(y.chunks_exact(d)).enumerate() {
             let gate = &self.modulation(modulations, tokens, kept, row)[part * d..][..d];
-            for ((x, y), gate) in x.iter_mut().zip(y).zip(gate) {
-                *x += gate * y;
-            }
+            add_gated_row(y, gate, x);
         }
     }
 }
 
 /// `out = x W^T + b`, or added to `out`; `x` has rows of `stride` elements, of which the layer reads its inputs.
-fn linear(layer: &Linear, x: &[f32], [rows, stride]: [usize; 2], out: &mut [f32], accumulate: bool) {
+fn linear(layer: &Linear, x: &[f32], sizes: [usize; 2], out: &mut [f32], accumulate: bool) {
+    linear_to(layer, x, sizes, out, layer.outputs, accumulate);
+}
+
+/// [`linear`] to rows that are `out_stride` apart.
+fn linear_to(
+    layer: &Linear,
+    x: &[f32],
+    [rows, stride]: [usize; 2],
+    out: &mut [f32],
+    out_stride: usize,
+    accumulate: bool,
+) {
     let a = Lhs { values: x, row_stride: stride, k_stride: 1 };
     let epilogue = Epilogue { accumulate, bias: layer.bias.as_deref() };
+    let sizes = [rows, layer.outputs, layer.inputs];
     span(Kind::LinearForward, 2 * rows * layer.outputs * layer.inputs, || {
-        gemm(
-            [rows, layer.outputs, layer.inputs],
-            a,
-            Rhs::Packed(&layer.weight),
-            out,
-            layer.outputs,
-            epilogue,
-        );
+        gemm(sizes, a, Rhs::Packed(&layer.weight), out, out_stride, epilogue);
     });
 }
 
+/// `out = mlp(x)`, block by block of hidden columns; `x` [rows, inputs], `hidden` and `out` grow as needed.
+fn mlp(mlp: &Mlp, x: &[f32], rows: usize, hidden: &mut Vec<f32>, out: &mut Vec<f32>) {
+    let out = sized(out, rows * mlp.outputs);
+    for (index, [up, down]) in mlp.blocks.iter().enumerate() {
+        let hidden = sized(hidden, rows * up.outputs);
+        linear(up, x, [rows, up.inputs], hidden, false);
+        span(Kind::Gelu, 0, || gelu_in_place(hidden));
+        linear(down, hidden, [rows, down.inputs], out, index > 0);
+    }
+}
+
 vectorized! {
+    /// `x += gate * y`.
+    fn add_gated_row(y: &[f32], gate: &[f32], x: &mut [f32]) {
+        for ((x, y), gate) in x.iter_mut().zip(y).zip(gate) {
+            *x = mul_add::<FMA>(*gate, *y, *x);
+        }
+    }
+
     /// `x / (1 + exp(-x))`, in place.
     fn silu(x: &mut [f32]) {
         for x in x.iter_mut() {
@@ -280,29 +324,42 @@ vectorized! {
         }
     }
 
-    /// Attention of one query over the keys and values seen, [seen, heads x width], head by head.
+    /// Attention of one query over the keys and values seen, [seen, heads x width]. `scores` [at least seen + 1, heads] is
+    /// memory: heads lie side by side in it, so that exponentials are taken of many at once.
     fn attend(q: &[f32], keys: &[f32], values: &[f32], width: usize, scores: &mut [f32], output: &mut [f32]) {
         let inner = q.len();
-        let seen = keys.len() / inner;
-        let scores = &mut scores[..seen];
+        let (seen, heads) = (keys.len() / inner, inner / width);
         let scale = 1.0 / (width as f32).sqrt();
-        for (head, output) in output.chunks_exact_mut(width).enumerate() {
-            let at = |row: usize| row * inner + head * width;
-            let q = &q[head * width..][..width];
-            let mut largest = f32::NEG_INFINITY;
-            for (row, score) in scores.iter_mut().enumerate() {
-                *score = dot::<FMA>(q, &keys[at(row)..][..width]) * scale;
-                largest = if *score > largest { *score } else { largest };
+        let (largest, scores) = scores.split_at_mut(heads);
+        let scores = &mut scores[..seen * heads];
+        largest.fill(f32::NEG_INFINITY);
+        for (scores, keys) in scores.chunks_exact_mut(heads).zip(keys.chunks_exact(inner)) {
+            let products = q.chunks_exact(width).zip(keys.chunks_exact(width));
+            for (score, (q, key)) in scores.iter_mut().zip(products) {
+                *score = dot::<FMA>(q, key) * scale;
             }
-            let mut total = 0.0;
-            for score in scores.iter_mut() {
+            for (largest, score) in largest.iter_mut().zip(scores.iter()) {
+                *largest = if *score > *largest { *score } else { *largest };
+            }
+        }
+        for scores in scores.chunks_exact_mut(heads) {
+            for (score, largest) in scores.iter_mut().zip(largest.iter()) {
                 *score = exp::<FMA>(*score - largest);
-                total += *score;
             }
-            output.fill(0.0);
-            for (row, score) in scores.iter().enumerate() {
+        }
+        let totals = largest;
+        totals.fill(0.0);
+        for scores in scores.chunks_exact(heads) {
+            for (total, score) in totals.iter_mut().zip(scores) {
+                *total += score;
+            }
+        }
+        output.fill(0.0);
+        for (scores, values) in scores.chunks_exact(heads).zip(values.chunks_exact(inner)) {
+            let heads = output.chunks_exact_mut(width).zip(values.chunks_exact(width));
+            for ((output, values), (score, total)) in heads.zip(scores.iter().zip(totals.iter())) {
                 let weight = score / total;
-                for (output, value) in output.iter_mut().zip(&values[at(row)..][..width]) {
+                for (output, value) in output.iter_mut().zip(values) {
                     *output = mul_add::<FMA>(weight, *value, *output);
                 }
             }

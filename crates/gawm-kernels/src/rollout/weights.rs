@@ -34,10 +34,80 @@ impl Linear {
         Linear::of(weight, bias.len(), Some(bias.to_vec()))
     }
 
+    /// The columns `first..first + inputs` of a weight [outputs, stride].
+    fn of_columns(weight: &[f32], [outputs, stride]: [usize; 2], first: usize, inputs: usize) -> Linear {
+        let mut packed = Packed::default();
+        packed.fill(&weight[first..], [inputs, outputs], [1, stride]);
+        Linear { weight: packed, bias: None, inputs, outputs }
+    }
+
     fn of(weight: &[f32], outputs: usize, bias: Option<Vec<f32>>) -> Linear {
         let inputs = weight.len() / outputs;
         assert_eq!(weight.len(), inputs * outputs, "rollout: size of a weight");
         Linear { weight: Packed::of_transposed(weight, [outputs, inputs]), bias, inputs, outputs }
+    }
+}
+
+/// Two linear layers with a GELU between, in blocks of hidden columns: a block's hidden values stay in the cache from the
+/// first layer to the second, and every weight is read once per group of sequences.
+#[derive(Debug)]
+pub(super) struct Mlp {
+    /// Expansion to the columns of a block, and contraction of them; the first contraction adds the bias.
+    pub(super) blocks: Vec<[Linear; 2]>,
+    pub(super) outputs: usize,
+}
+
+/// Hidden columns of a block.
+const HIDDEN: usize = 256;
+
+impl Mlp {
+    fn new(expand: &[f32], expand_bias: &[f32], contract: &[f32], contract_bias: &[f32]) -> Mlp {
+        let (hidden, outputs) = (expand_bias.len(), contract_bias.len());
+        let inputs = expand.len() / hidden;
+        assert_eq!(contract.len(), hidden * outputs, "rollout: size of a weight");
+        let block = |first: usize| {
+            let count = HIDDEN.min(hidden - first);
+            let rows = &expand[first * inputs..(first + count) * inputs];
+            let up = Linear::new(rows, &expand_bias[first..first + count]);
+            let mut down = Linear::of_columns(contract, [outputs, hidden], first, count);
+            down.bias = (first == 0).then(|| contract_bias.to_vec());
+            [up, down]
+        };
+        Mlp { blocks: (0..hidden).step_by(HIDDEN).map(block).collect(), outputs }
+    }
+}
+
+/// Some heads of an attention, whose queries, keys and values stay in the cache until their output is added.
+#[derive(Debug)]
+pub(super) struct Heads {
+    pub(super) q: Linear,
+    pub(super) k: Linear,
+    pub(super) v: Linear,
+    /// What these heads add to the output; the first ones add the bias.
+    pub(super) output: Linear,
+}
+
+impl Heads {
+    /// Splits all heads into groups of about [`HIDDEN`] columns.
+    fn all(shape: &RolloutShape, qkv: &[f32], output: &[f32], bias: &[f32]) -> Vec<Heads> {
+        let (inner, latent) = (shape.heads * shape.head_width, shape.latent);
+        assert_eq!(
+            [qkv.len(), output.len()],
+            [3 * inner * latent, bias.len() * inner],
+            "rollout: sizes of weights of attention"
+        );
+        let columns = (HIDDEN / shape.head_width).max(1) * shape.head_width;
+        let group = |first: usize| {
+            let count = columns.min(inner - first);
+            let part = |index: usize| {
+                let rows = &qkv[(index * inner + first) * latent..][..count * latent];
+                Linear::of(rows, count, None)
+            };
+            let mut down = Linear::of_columns(output, [bias.len(), inner], first, count);
+            down.bias = (first == 0).then(|| bias.to_vec());
+            Heads { q: part(0), k: part(1), v: part(2), output: down }
+        };
+        (0..inner).step_by(columns).map(group).collect()
     }
 }
 
@@ -58,13 +128,9 @@ impl Norm {
 pub(super) struct Block {
     pub(super) modulation: Linear,
     pub(super) attn_norm: Norm,
-    pub(super) q: Linear,
-    pub(super) k: Linear,
-    pub(super) v: Linear,
-    pub(super) output: Linear,
+    pub(super) heads: Vec<Heads>,
     pub(super) mlp_norm: Norm,
-    pub(super) expand: Linear,
-    pub(super) contract: Linear,
+    pub(super) mlp: Mlp,
 }
 
 #[derive(Debug)]
@@ -73,33 +139,23 @@ pub(super) struct Packs {
     pub(super) positions: Vec<f32>,
     pub(super) blocks: Vec<Block>,
     pub(super) norm: Norm,
-    /// The first layer, with the batch norm of running statistics folded in: `w' = w s`, `b' = (b - mean) s + shift`,
-    /// `s = scale / sqrt(var + epsilon)`.
-    pub(super) project: Linear,
-    pub(super) finish: Linear,
+    /// The projector, with the batch norm of running statistics folded into its first layer: `w' = w s`,
+    /// `b' = (b - mean) s + shift`, `s = scale / sqrt(var + epsilon)`.
+    pub(super) project: Mlp,
 }
 
 impl Packs {
     pub(super) fn new(shape: &RolloutShape, parameters: &RolloutParameters<'_>) -> Packs {
-        let inner = shape.heads * shape.head_width;
         let [a, a_bias, b, b_bias, c, c_bias] = parameters.embedder;
         let block = |parameters: &[&[f32]; 13]| {
             let [ada, ada_bias, norm1, bias1, qkv, out, out_bias, norm2, bias2, up, up_bias, down, down_bias] =
                 *parameters;
-            let part = |index: usize| {
-                let size = inner * shape.latent;
-                Linear::of(&qkv[index * size..(index + 1) * size], inner, None)
-            };
             Block {
                 modulation: Linear::new(ada, ada_bias),
                 attn_norm: Norm::new(norm1, bias1),
-                q: part(0),
-                k: part(1),
-                v: part(2),
-                output: Linear::new(out, out_bias),
+                heads: Heads::all(shape, qkv, out, out_bias),
                 mlp_norm: Norm::new(norm2, bias2),
-                expand: Linear::new(up, up_bias),
-                contract: Linear::new(down, down_bias),
+                mlp: Mlp::new(up, up_bias, down, down_bias),
             }
         };
         let [first, first_bias, scale, shift, mean, variance, last, last_bias] = parameters.projector;
@@ -121,8 +177,7 @@ impl Packs {
             positions: parameters.positions.to_vec(),
             blocks: parameters.blocks.iter().map(block).collect(),
             norm: Norm::new(parameters.norm[0], parameters.norm[1]),
-            project: Linear::new(&folded, &folded_bias),
-            finish: Linear::new(last, last_bias),
+            project: Mlp::new(&folded, &folded_bias, last, last_bias),
         }
     }
 }

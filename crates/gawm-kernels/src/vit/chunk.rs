@@ -2,11 +2,12 @@
 
 use super::VitShape;
 use super::layer::{LayerPass, LayerState};
+use super::products::{Matrix, Operands};
 use super::weights::{
     CLASS_TOKEN, LAST_NORM, LAYER_PARAMETERS, Layout, OUTER_PARAMETERS, PATCH_BIAS, PATCH_WEIGHT, Packs,
 };
 use crate::attention::AttentionScratch;
-use crate::gemm::{ACCUMULATE, Epilogue, Lhs, Rhs, gemm};
+use crate::gemm::Epilogue;
 use crate::norm;
 use crate::profile::{Kind, span};
 
@@ -51,10 +52,19 @@ impl<'a> Images<'a> {
             for (line, out) in out.chunks_exact_mut(p).enumerate() {
                 let (channel, y) = (line / p, row * p + line % p);
                 let start = (channel * self.height + y) * self.width + column * p;
-                out.copy_from_slice(&image[start..start + p]);
+                copy_short(&image[start..start + p], out);
             }
         }
     }
+}
+
+/// Copies a few values, for which a call of the C library's copy would take longer than the copying.
+fn copy_short(from: &[f32], to: &mut [f32]) {
+    let ((from, from_rest), (to, to_rest)) = (from.as_chunks::<4>(), to.as_chunks_mut::<4>());
+    to.iter_mut().zip(from).for_each(|(to, from)| *to = *from);
+    let (from, to) = (from_rest.as_chunks::<2>(), to_rest.as_chunks_mut::<2>());
+    to.0.iter_mut().zip(from.0).for_each(|(to, from)| *to = *from);
+    to.1.iter_mut().zip(from.1).for_each(|(to, from)| *to = *from);
 }
 
 /// Values of a chunk that its backward pass reads.
@@ -78,6 +88,7 @@ pub(super) struct Scratch {
     pub(super) k: Vec<f32>,
     pub(super) v: Vec<f32>,
     pub(super) attention: AttentionScratch,
+    pub(super) operands: Operands,
 }
 
 /// Returns the first `count` elements, growing the vector where it is shorter; what it held stays or is zero.
@@ -167,9 +178,17 @@ impl Pass<'_> {
             let (class, projected) = tokens.split_at_mut(w);
             class.copy_from_slice(self.parameters[CLASS_TOKEN]);
             let epilogue = Epilogue { accumulate: false, bias: Some(self.parameters[PATCH_BIAS]) };
-            let a = Lhs { values: patches, row_stride: values, k_stride: 1 };
+            let x = Matrix { values: patches, stride: values };
             span(Kind::LinearForward, 2 * n_patches * w * values, || {
-                gemm([n_patches, w, values], a, Rhs::Packed(self.packs.patch()), projected, w, epilogue);
+                let sizes = [n_patches, w, values];
+                scratch.operands.by_weight(
+                    shape.products,
+                    sizes,
+                    x,
+                    self.packs.patch(),
+                    (projected, w),
+                    epilogue,
+                );
             });
             norm::add(self.positions, tokens);
         }
@@ -189,11 +208,11 @@ impl Pass<'_> {
                 norm::add(tokens, layout.one(sums, layout.positions()));
                 norm::add_columns(projected, layout.one(sums, PATCH_BIAS));
             });
-            let a = Lhs { values: projected, row_stride: 1, k_stride: w };
-            let b = Rhs::Rows { values: patches, stride: values };
+            let (dy, x) =
+                (Matrix { values: projected, stride: w }, Matrix { values: patches, stride: values });
             span(Kind::LinearWeightGradient, 2 * n_patches * w * values, || {
                 let d_weight = layout.one(sums, PATCH_WEIGHT);
-                gemm([w, values, n_patches], a, b, d_weight, values, ACCUMULATE);
+                scratch.operands.of_weight(shape.products, [n_patches, w, values], dy, x, d_weight);
             });
         }
     }

@@ -2,10 +2,11 @@
 
 use super::VitShape;
 use super::chunk::{Scratch, sized};
+use super::products::{Matrix, Operands};
 use super::weights::{CONTRACT, EXPAND, KEY, Layout, NORM_AFTER, NORM_BEFORE, OUTPUT, Packs, QUERY, VALUE};
 use crate::attention::{Attention, AttentionGradients, AttentionInputs};
 use crate::gelu::{gelu, gelu_backward};
-use crate::gemm::{ACCUMULATE, Epilogue, Lhs, Rhs, STORE, gemm};
+use crate::gemm::{ACCUMULATE, Epilogue, STORE};
 use crate::norm;
 use crate::profile::{Kind, span};
 
@@ -64,9 +65,30 @@ impl LayerPass<'_> {
         let x = sized(&mut scratch.x, tokens * w);
         let y = sized(&mut scratch.y, tokens * w);
         self.norm(NORM_BEFORE, x, &mut state.xhat_before, &mut state.rstd_before, y);
-        self.linear(QUERY, [rows, w, w], y, self.query_stride(), sized(&mut state.q, rows * w), false);
-        self.linear(KEY, [tokens, w, w], y, w, sized(&mut state.k, tokens * w), false);
-        self.linear(VALUE, [tokens, w, w], y, w, sized(&mut state.v, tokens * w), false);
+        self.linear(
+            QUERY,
+            [rows, w, w],
+            Matrix { values: y, stride: self.query_stride() },
+            sized(&mut state.q, rows * w),
+            false,
+            &mut scratch.operands,
+        );
+        self.linear(
+            KEY,
+            [tokens, w, w],
+            Matrix { values: y, stride: w },
+            sized(&mut state.k, tokens * w),
+            false,
+            &mut scratch.operands,
+        );
+        self.linear(
+            VALUE,
+            [tokens, w, w],
+            Matrix { values: y, stride: w },
+            sized(&mut state.v, tokens * w),
+            false,
+            &mut scratch.operands,
+        );
         self.attend(state, scratch);
 
         let x = &mut scratch.x[..tokens * w];
@@ -77,14 +99,35 @@ impl LayerPass<'_> {
             }
         }
         let x = &mut x[..rows * w];
-        self.linear(OUTPUT, [rows, w, w], &state.attended, w, x, true);
+        self.linear(
+            OUTPUT,
+            [rows, w, w],
+            Matrix { values: &state.attended, stride: w },
+            x,
+            true,
+            &mut scratch.operands,
+        );
         let y = &mut scratch.y[..rows * w];
         self.norm(NORM_AFTER, x, &mut state.xhat_after, &mut state.rstd_after, y);
         let expanded = sized(&mut state.expanded, rows * f);
-        self.linear(EXPAND, [rows, f, w], y, w, expanded, false);
+        self.linear(
+            EXPAND,
+            [rows, f, w],
+            Matrix { values: y, stride: w },
+            expanded,
+            false,
+            &mut scratch.operands,
+        );
         let hidden = sized(&mut scratch.hidden, rows * f);
         span(Kind::Gelu, 0, || gelu(expanded, hidden));
-        self.linear(CONTRACT, [rows, w, f], hidden, f, x, true);
+        self.linear(
+            CONTRACT,
+            [rows, w, f],
+            Matrix { values: hidden, stride: f },
+            x,
+            true,
+            &mut scratch.operands,
+        );
     }
 
     fn attend(&self, state: &mut LayerState, scratch: &mut Scratch) {
@@ -122,12 +165,43 @@ impl LayerPass<'_> {
         span(Kind::Norm, 0, || {
             norm::scale_shift(xhat, self.parameters[NORM_BEFORE], self.parameters[NORM_BEFORE + 1], y)
         });
-        self.weight_gradient(QUERY, [rows, w, w], &scratch.q, y, self.query_stride(), layout, sums);
-        self.weight_gradient(KEY, [tokens, w, w], &scratch.k, y, w, layout, sums);
-        self.weight_gradient(VALUE, [tokens, w, w], &scratch.v, y, w, layout, sums);
-        self.input_gradient(KEY, [tokens, w, w], &scratch.k, y, w, STORE);
-        self.input_gradient(VALUE, [tokens, w, w], &scratch.v, y, w, ACCUMULATE);
-        self.input_gradient(QUERY, [rows, w, w], &scratch.q, y, self.query_stride(), ACCUMULATE);
+        self.weight_gradient(
+            QUERY,
+            [rows, w, w],
+            &scratch.q,
+            Matrix { values: y, stride: self.query_stride() },
+            layout,
+            sums,
+            &mut scratch.operands,
+        );
+        self.weight_gradient(
+            KEY,
+            [tokens, w, w],
+            &scratch.k,
+            Matrix { values: y, stride: w },
+            layout,
+            sums,
+            &mut scratch.operands,
+        );
+        self.weight_gradient(
+            VALUE,
+            [tokens, w, w],
+            &scratch.v,
+            Matrix { values: y, stride: w },
+            layout,
+            sums,
+            &mut scratch.operands,
+        );
+        self.input_gradient(KEY, [tokens, w, w], &scratch.k, (y, w), STORE, &mut scratch.operands);
+        self.input_gradient(VALUE, [tokens, w, w], &scratch.v, (y, w), ACCUMULATE, &mut scratch.operands);
+        self.input_gradient(
+            QUERY,
+            [rows, w, w],
+            &scratch.q,
+            (y, self.query_stride()),
+            ACCUMULATE,
+            &mut scratch.operands,
+        );
 
         let dx = sized(&mut scratch.x, tokens * w);
         if self.queries == 1 {
@@ -158,16 +232,32 @@ impl LayerPass<'_> {
         let dx = &mut scratch.x[..rows * w];
         let hidden = sized(&mut scratch.hidden, rows * f);
         let d_hidden = sized(&mut scratch.d_hidden, rows * f);
-        self.input_gradient(CONTRACT, [rows, w, f], dx, d_hidden, f, STORE);
+        self.input_gradient(CONTRACT, [rows, w, f], dx, (d_hidden, f), STORE, &mut scratch.operands);
         span(Kind::Gelu, 0, || gelu_backward(&state.expanded[..rows * f], hidden, d_hidden));
-        self.weight_gradient(CONTRACT, [rows, w, f], dx, hidden, f, layout, sums);
+        self.weight_gradient(
+            CONTRACT,
+            [rows, w, f],
+            dx,
+            Matrix { values: hidden, stride: f },
+            layout,
+            sums,
+            &mut scratch.operands,
+        );
         let y = sized(&mut scratch.y, rows * w);
         let xhat = &state.xhat_after[..rows * w];
         span(Kind::Norm, 0, || {
             norm::scale_shift(xhat, self.parameters[NORM_AFTER], self.parameters[NORM_AFTER + 1], y)
         });
-        self.weight_gradient(EXPAND, [rows, f, w], d_hidden, y, w, layout, sums);
-        self.input_gradient(EXPAND, [rows, f, w], d_hidden, y, w, STORE);
+        self.weight_gradient(
+            EXPAND,
+            [rows, f, w],
+            d_hidden,
+            Matrix { values: y, stride: w },
+            layout,
+            sums,
+            &mut scratch.operands,
+        );
+        self.input_gradient(EXPAND, [rows, f, w], d_hidden, (y, w), STORE, &mut scratch.operands);
         self.norm_backward(NORM_AFTER, y, xhat, &state.rstd_after, dx, layout, sums);
     }
 
@@ -178,8 +268,16 @@ impl LayerPass<'_> {
         let n_sums = self.shape.heads * self.queries;
         let dx = &scratch.x[..rows * w];
         let d_attended = sized(&mut scratch.attended, rows * w);
-        self.weight_gradient(OUTPUT, [rows, w, w], dx, &state.attended, w, layout, sums);
-        self.input_gradient(OUTPUT, [rows, w, w], dx, d_attended, w, STORE);
+        self.weight_gradient(
+            OUTPUT,
+            [rows, w, w],
+            dx,
+            Matrix { values: &state.attended, stride: w },
+            layout,
+            sums,
+            &mut scratch.operands,
+        );
+        self.input_gradient(OUTPUT, [rows, w, w], dx, (d_attended, w), STORE, &mut scratch.operands);
         let (dq, dk, dv) = (
             sized(&mut scratch.q, rows * w),
             sized(&mut scratch.k, tokens * w),
@@ -239,12 +337,20 @@ impl LayerPass<'_> {
     }
 
     /// `out = x W^T + b`, or added to `out`; sizes are [rows, outputs, inputs].
-    fn linear(&self, which: usize, sizes: [usize; 3], x: &[f32], stride: usize, out: &mut [f32], add: bool) {
+    fn linear(
+        &self,
+        which: usize,
+        sizes: [usize; 3],
+        x: Matrix<'_>,
+        out: &mut [f32],
+        add: bool,
+        operands: &mut Operands,
+    ) {
         let [rows, outputs, inputs] = sizes;
-        let a = Lhs { values: x, row_stride: stride, k_stride: 1 };
         let epilogue = Epilogue { accumulate: add, bias: Some(self.parameters[which + 1]) };
         span(Kind::LinearForward, 2 * rows * outputs * inputs, || {
-            gemm(sizes, a, Rhs::Packed(self.packs.linear(self.index, which)), out, outputs, epilogue);
+            let weight = self.packs.linear(self.index, which);
+            operands.by_weight(self.shape.products, sizes, x, weight, (out, outputs), epilogue);
         });
     }
 
@@ -254,34 +360,33 @@ impl LayerPass<'_> {
         which: usize,
         [rows, outputs, inputs]: [usize; 3],
         dy: &[f32],
-        dx: &mut [f32],
-        stride: usize,
+        dx: (&mut [f32], usize),
         epilogue: Epilogue<'_>,
+        operands: &mut Operands,
     ) {
-        let a = Lhs { values: dy, row_stride: outputs, k_stride: 1 };
-        let b = Rhs::Packed(self.packs.linear(self.index, which));
+        let dy = Matrix { values: dy, stride: outputs };
         span(Kind::LinearInputGradient, 2 * rows * outputs * inputs, || {
-            gemm([rows, inputs, outputs], a, b, dx, stride, epilogue);
+            let weight = self.packs.linear(self.index, which);
+            operands.by_weight(self.shape.products, [rows, inputs, outputs], dy, weight, dx, epilogue);
         });
     }
 
-    /// Adds `dy^T x` and the columns of `dy` to the sums; rows of `x` are `stride` apart; sizes as above.
+    /// Adds `dy^T x` and the columns of `dy` to the sums; sizes as above.
     #[expect(clippy::too_many_arguments, reason = "both factors, their sizes, and where gradients go")]
     fn weight_gradient(
         &self,
         which: usize,
         [rows, outputs, inputs]: [usize; 3],
         dy: &[f32],
-        x: &[f32],
-        stride: usize,
+        x: Matrix<'_>,
         layout: &Layout,
         sums: &mut [f32],
+        operands: &mut Operands,
     ) {
         let (d_weight, d_bias) = layout.pair(sums, self.first + which);
-        let a = Lhs { values: dy, row_stride: 1, k_stride: outputs };
-        let b = Rhs::Rows { values: x, stride };
         span(Kind::LinearWeightGradient, 2 * rows * outputs * inputs, || {
-            gemm([outputs, inputs, rows], a, b, d_weight, inputs, ACCUMULATE);
+            let dy = Matrix { values: dy, stride: outputs };
+            operands.of_weight(self.shape.products, [rows, outputs, inputs], dy, x, d_weight);
         });
         span(Kind::ColumnSums, 0, || norm::add_columns(&dy[..rows * outputs], d_bias));
     }

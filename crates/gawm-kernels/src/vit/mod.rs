@@ -9,6 +9,7 @@
 
 mod chunk;
 mod layer;
+mod products;
 mod weights;
 
 use std::sync::Mutex;
@@ -45,6 +46,18 @@ pub struct VitShape {
     pub mlp_width: usize,
     /// Added to the variance in the norms.
     pub epsilon: f32,
+    /// How products of linear layers are computed.
+    pub products: Products,
+}
+
+/// How the products of linear layers are computed; attention, norms and sums are f32 always.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Products {
+    /// In f32.
+    #[default]
+    Single,
+    /// Operands rounded to bf16, sums in f32; only where [`crate::pairs::available`].
+    Pairs,
 }
 
 /// Tokens that a chunk has at least, unless there are no more.
@@ -165,7 +178,7 @@ impl Vit {
         span(Kind::Packing, 0, || packs.pack_backward(shape, parameters));
         let VitState(mut states) = state;
         let n_chunks = states.len();
-        let per_group = n_chunks.div_ceil(GROUPS.min(n_chunks)).max(1);
+        let per_group = n_chunks.div_ceil(GROUPS).max(1);
         let groups: Vec<Vec<f32>> = states
             .par_chunks_mut(per_group)
             .enumerate()

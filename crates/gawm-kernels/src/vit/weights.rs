@@ -2,8 +2,9 @@
 
 use rayon::prelude::*;
 
-use super::{VitGradients, VitShape, sum_range};
+use super::{Products, VitGradients, VitShape, sum_range};
 use crate::gemm::Packed;
+use crate::pairs::{pair_columns, pair_rows};
 
 /// Parameters outside the layers, first in order: weight [width, channels x patch^2] and bias of the patch projection,
 /// class token, weight and bias of the last norm.
@@ -40,17 +41,29 @@ pub(super) struct Packs {
 impl Packs {
     /// Panels of the transposed weights, for `x W^T`.
     pub(super) fn pack_forward(&mut self, shape: &VitShape, parameters: &[&[f32]]) {
-        let k = shape.patch_values();
-        self.patch.fill(parameters[PATCH_WEIGHT], [k, shape.width], [1, k]);
-        self.pack_layers(shape, parameters, |packed, weight, [outputs, inputs]| {
-            packed.fill(weight, [inputs, outputs], [1, inputs]);
-        });
+        let pack = |packed: &mut Packed, weight: &[f32], [outputs, inputs]: [usize; 2]| match shape.products {
+            Products::Single => packed.fill(weight, [inputs, outputs], [1, inputs]),
+            Products::Pairs => {
+                let k = inputs.div_ceil(2);
+                let mut pairs = vec![0.0; outputs * k];
+                pair_columns(weight, inputs, [outputs, inputs], &mut pairs);
+                packed.fill(&pairs, [k, outputs], [1, k]);
+            }
+        };
+        pack(&mut self.patch, parameters[PATCH_WEIGHT], [shape.width, shape.patch_values()]);
+        self.pack_layers(shape, parameters, pack);
     }
 
     /// Panels of the weights, for `dy W`.
     pub(super) fn pack_backward(&mut self, shape: &VitShape, parameters: &[&[f32]]) {
-        self.pack_layers(shape, parameters, |packed, weight, [outputs, inputs]| {
-            packed.fill(weight, [outputs, inputs], [inputs, 1]);
+        self.pack_layers(shape, parameters, |packed, weight, [outputs, inputs]| match shape.products {
+            Products::Single => packed.fill(weight, [outputs, inputs], [inputs, 1]),
+            Products::Pairs => {
+                let k = outputs.div_ceil(2);
+                let mut pairs = vec![0.0; k * inputs];
+                pair_rows(weight, inputs, [outputs, inputs], &mut pairs);
+                packed.fill(&pairs, [k, inputs], [inputs, 1]);
+            }
         });
     }
 

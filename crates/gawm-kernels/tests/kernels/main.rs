@@ -2,8 +2,12 @@
 #![expect(clippy::unwrap_used, reason = "a test ends where its helper does")]
 
 mod attention;
+mod composed;
 mod gemm;
+mod head;
 mod linear;
+mod pairs;
 mod pointwise;
+mod predictor;
 mod reference;
 mod vit;

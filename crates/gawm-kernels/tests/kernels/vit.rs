@@ -1,7 +1,7 @@
 //! The fused transformer against one composed of candle's differentiable operations: values and every gradient.
 
 use candle_core::{D, DType, Device, IndexOp, Result, Tensor, Var};
-use gawm_kernels::vit::VitShape;
+use gawm_kernels::vit::{Products, VitShape};
 use gawm_kernels::{GradientSink, VitEncoder};
 
 use crate::reference::{assert_close, at_all_levels, noise};
@@ -139,6 +139,7 @@ const SMALL: VitShape = VitShape {
     heads: 2,
     mlp_width: 10,
     epsilon: 1e-5,
+    products: Products::Single,
 };
 
 #[test]

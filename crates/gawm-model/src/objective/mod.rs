@@ -18,7 +18,7 @@ use crate::pass::Pass;
 pub use clips::{Clips, ClipsError, StateRule};
 pub use collapse::{KNOTS, covariance, sigreg, sigreg_projections, sigreg_weights, standard_deviation};
 pub use straightening::straightening;
-pub use table::{Control, ObjectiveError, Objectives, PRESETS, Term};
+pub use table::{Control, ObjectiveError, Objectives, ObjectivesTable, PRESETS, Term};
 
 /// The loss of a batch: every term, and their weighted sum.
 #[derive(Debug, Clone)]

@@ -1,6 +1,7 @@
 //! The weights of the objectives: presets, overrides, controls.
 
 use candle_core::{DType, Device, Tensor};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -11,7 +12,7 @@ use crate::pass::Pass;
 use crate::random::permutation;
 
 /// A term of the loss.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
 pub enum Term {
@@ -70,7 +71,7 @@ impl Term {
 }
 
 /// A control experiment: what is broken on purpose.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Control {
     /// Nothing.
@@ -165,15 +166,22 @@ pub enum ObjectiveError {
     },
 }
 
-/// A table as it is written.
-#[derive(Debug, Default, Deserialize)]
+/// The table as it is written; [`Objectives::from_table`] reads it.
+#[derive(Debug, Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case", default)]
-struct Overrides {
+pub struct ObjectivesTable {
+    /// What the weights start from, one of [`PRESETS`]; `sa-idm` by default.
     preset: Option<String>,
+    /// Weights that differ from the preset's; 0 leaves a term out.
+    #[schemars(with = "std::collections::BTreeMap<Term, f64>")]
     weights: toml::Table,
+    /// Terms without a weight that are computed and logged all the same.
     monitored: Vec<Term>,
+    /// What is broken on purpose.
     control: Option<Control>,
+    /// Number of directions that SIGReg projects on; 1024 by default.
     sigreg_projections: Option<usize>,
+    /// What the inverse dynamics head sees.
     inverse_input: Option<InverseInput>,
 }
 
@@ -241,6 +249,12 @@ impl Objectives {
         Ok(table)
     }
 
+    /// Returns the name of the preset that this table is, whatever is monitored beside it.
+    pub fn preset_name(&self) -> Option<&'static str> {
+        let bare = Objectives { monitored: Vec::new(), ..self.clone() };
+        PRESETS.into_iter().find(|name| Objectives::preset(name).is_ok_and(|preset| preset == bare))
+    }
+
     /// Reads a table such as `preset = "lewm"`, `weights = { sigreg = 0.02 }`, `monitored = ["straightening"]`.
     ///
     /// # Errors
@@ -248,7 +262,7 @@ impl Objectives {
     /// - [`ObjectiveError`] with the key or value that does not belong there.
     pub fn from_table(table: toml::Table) -> Result<Objectives, ObjectiveError> {
         let syntax = |message: String| ObjectiveError::Syntax { message };
-        let overrides: Overrides =
+        let overrides: ObjectivesTable =
             table.try_into().map_err(|error: toml::de::Error| syntax(error.message().to_owned()))?;
         let mut objectives = match &overrides.preset {
             Some(name) => Objectives::preset(name)?,

@@ -5,4 +5,5 @@ mod checkpoints;
 mod fixture;
 mod gradients;
 mod objectives;
+mod shapes;
 mod training;

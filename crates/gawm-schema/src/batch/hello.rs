@@ -219,9 +219,11 @@ impl Hello {
             return Err(HelloError::Contradiction { field: "history", expected, got });
         }
         let scales = self.state.dims.iter().chain(&self.action.dims);
-        if let Some(dim) = scales.into_iter().find(|d| !d.scale.is_normal() || !d.mean.is_finite()) {
+        if let Some(dim) =
+            scales.into_iter().find(|d| !(d.scale.is_normal() && d.scale > 0.0) || !d.mean.is_finite())
+        {
             let got = format!("{} with mean {} and scale {}", dim.name, dim.mean, dim.scale);
-            let expected = "finite and not 0".to_owned();
+            let expected = "finite, the scale above 0".to_owned();
             return Err(HelloError::Contradiction { field: "standardisation", expected, got });
         }
         Ok(())

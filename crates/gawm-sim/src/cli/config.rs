@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use gawm_schema::pipeline::{Override, OverrideError, SECTIONS, unknown_section};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -9,18 +11,18 @@ use crate::collect::{CollectOptions, ImageFormat};
 use crate::two_room::{ExpertConfig, FRAME_SIZE, TwoRoomConfig};
 
 /// Environments that can be collected from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
-pub(super) enum EnvironmentName {
+pub enum EnvironmentName {
     /// A dot that goes to a target, through the door of a wall
     #[default]
     TwoRoom,
 }
 
 /// How frames are stored.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
-pub(super) enum ImageName {
+pub enum ImageName {
     /// Lossless
     #[default]
     Png,
@@ -29,9 +31,9 @@ pub(super) enum ImageName {
 }
 
 /// The section `[sim]` of a pipeline, or a file of its own.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
-pub(super) struct SimConfig {
+pub struct SimConfig {
     /// Environment.
     pub(super) env: EnvironmentName,
     /// Number of episodes; needed.
@@ -83,7 +85,7 @@ impl Default for SimConfig {
 /// Why a configuration cannot be used.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub(super) enum SimConfigError {
+pub enum SimConfigError {
     /// The file cannot be read.
     #[error("cannot read {}", path.display())]
     Read {
@@ -100,6 +102,9 @@ pub(super) enum SimConfigError {
         /// Why.
         detail: String,
     },
+    /// An override does not fit.
+    #[error(transparent)]
+    Override(#[from] OverrideError),
     /// A value is missing or out of range.
     #[error("{key}: expected {expected}, got {got}")]
     Value {
@@ -123,6 +128,9 @@ impl SimConfig {
                     .map_err(|source| SimConfigError::Read { path: path.to_owned(), source })?;
                 let mut whole: toml::Table =
                     text.parse().map_err(|e: toml::de::Error| syntax(e.to_string()))?;
+                if let Some(name) = whole.contains_key("sim").then(|| unknown_section(&whole)).flatten() {
+                    return Err(syntax(format!("unknown section [{name}], expected one of {SECTIONS:?}")));
+                }
                 match whole.remove("sim") {
                     Some(toml::Value::Table(section)) => section,
                     Some(_) => return Err(syntax("expected [sim] to be a table".to_owned())),
@@ -132,8 +140,7 @@ impl SimConfig {
             None => toml::Table::new(),
         };
         for text in overrides {
-            set(&mut section, text)
-                .map_err(|detail| SimConfigError::Syntax { place: format!("--set {text}"), detail })?;
+            Override::of_section("sim", text)?.apply(&mut section)?;
         }
         toml::Value::Table(section).try_into().map_err(|e: toml::de::Error| syntax(e.to_string()))
     }
@@ -186,27 +193,6 @@ impl SimConfig {
             image_size: Some(self.size.into()),
         })
     }
-}
-
-/// Sets one value: `key.key=value`, the value in TOML, a plain word as text.
-fn set(section: &mut toml::Table, text: &str) -> Result<(), String> {
-    let (key, value) =
-        text.split_once('=').ok_or_else(|| "expected key=value, such as max_steps=30".to_owned())?;
-    let value = value.trim();
-    let parsed = format!("v = {value}").parse::<toml::Table>().ok().and_then(|mut table| table.remove("v"));
-    let value = parsed.unwrap_or_else(|| toml::Value::String(value.to_owned()));
-    let key = key.trim();
-    let mut parts = key.strip_prefix("sim.").unwrap_or(key).split('.').peekable();
-    let mut at = section;
-    while let Some(part) = parts.next() {
-        if parts.peek().is_none() {
-            at.insert(part.to_owned(), value);
-            return Ok(());
-        }
-        let below = at.entry(part.to_owned()).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-        at = below.as_table_mut().ok_or_else(|| format!("{part:?} is a plain value"))?;
-    }
-    Err("expected a key".to_owned())
 }
 
 #[cfg(test)]

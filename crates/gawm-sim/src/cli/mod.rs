@@ -17,7 +17,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use crate::collect::{CollectError, CollectSummary, collect_until};
 use crate::environment::{Environment, Frame};
 use crate::two_room::{TwoRoom, TwoRoomConfig};
-use config::{EnvironmentName, ImageName, SimConfig, SimConfigError};
+pub use config::{EnvironmentName, ImageName, SimConfig, SimConfigError};
 
 /// Failed, nothing usable.
 const EXIT_FAILED: u8 = 1;

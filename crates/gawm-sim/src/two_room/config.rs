@@ -1,5 +1,6 @@
 //! What can vary in TwoRoom, with the ranges of the published environment.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -17,7 +18,7 @@ pub const DOOR_MARGIN_PX: f32 = 1.75;
 pub const PUSHBACK_PX: f64 = 0.5;
 
 /// How the wall lies.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum WallAxis {
     /// The wall is horizontal and divides y.
@@ -43,7 +44,7 @@ impl WallAxis {
 }
 
 /// A gap in the wall.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Door {
     /// Centre, along the wall, in pixels: 0 to 223.
@@ -53,7 +54,7 @@ pub struct Door {
 }
 
 /// Colours of what is drawn, RGB.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Colors {
     /// The agent's dot.
@@ -81,7 +82,7 @@ impl Default for Colors {
 }
 
 /// What can vary in TwoRoom. The default is the published task.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct TwoRoomConfig {
     /// How the wall lies.

@@ -6,11 +6,12 @@ use std::time::{Duration, Instant};
 use anyhow::anyhow;
 use gawm_model::{AdamW, DataWidths, Device, Pass, WorldModel};
 use gawm_schema::batch::Hello;
+use gawm_schema::pipeline::Override;
 
 use super::failure::Failure;
 use super::{BenchArgs, Exit};
 use crate::batch::{Batch, Uploader};
-use crate::config::{Config, Override};
+use crate::config::Config;
 use crate::interrupt::Interrupt;
 use crate::loaders::{LoaderCommand, LoaderOptions, LoaderProgram, Loaders};
 use crate::source::{BatchSource, Expected};
@@ -50,10 +51,7 @@ pub(super) fn run(arguments: &BenchArgs, program: LoaderProgram) -> Result<Exit,
     let steps = 2 + arguments.rounds * (block + slots);
     let fields =
         [("steps", steps), ("validation_batches", 0), ("validate_every", steps), ("warmup_steps", 0)];
-    overrides.extend(fields.map(|(field, value)| Override {
-        path: vec!["train".to_owned(), field.to_owned()],
-        value: toml::Value::Integer(value as i64),
-    }));
+    overrides.extend(fields.map(|(field, value)| Override::new(&["train", field], value as i64)));
     let config = Config::read(path, &overrides)?;
 
     let failed = |error: std::io::Error| Failure::failed(error.into());

@@ -1,10 +1,11 @@
 //! From text to a checked [`Config`], and back to the TOML that lies beside a result.
 
 use gawm_model::{ModelConfig, Objectives, Term};
+use gawm_schema::pipeline::{Override, SECTIONS, unknown_section};
 use serde::Deserialize;
 use toml::Value;
 
-use super::{Config, ConfigError, Override, SECTIONS, TrainConfig, objectives};
+use super::{Config, ConfigError, TrainConfig, objectives};
 
 /// The shape of a file, for errors with line and column; its values are read again when overrides are applied.
 #[derive(Debug, Deserialize)]
@@ -30,7 +31,12 @@ impl Config {
         for change in overrides {
             change.apply(&mut table)?;
         }
-        check_names(place, &table)?;
+        if let Some(name) = unknown_section(&table) {
+            return Err(ConfigError::Section {
+                place: place.to_owned(),
+                message: format!("unknown section {name:?}: expected one of {SECTIONS:?}"),
+            });
+        }
 
         let mut config = Config {
             model: model(place, &table)?,
@@ -65,17 +71,6 @@ impl Config {
         all.insert("objectives".to_owned(), Value::Table(objectives_table(&self.objectives)));
         all.insert("train".to_owned(), table(toml::Table::try_from(&self.train)));
         all.to_string()
-    }
-}
-
-/// Refuses names at the top that are no sections: a typo there would switch a whole section off.
-fn check_names(place: &str, table: &toml::Table) -> Result<(), ConfigError> {
-    match table.keys().find(|key| !SECTIONS.contains(&key.as_str())) {
-        None => Ok(()),
-        Some(name) => Err(ConfigError::Section {
-            place: place.to_owned(),
-            message: format!("unknown section {name:?}: expected one of {SECTIONS:?}"),
-        }),
     }
 }
 

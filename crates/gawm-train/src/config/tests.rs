@@ -16,7 +16,8 @@ rate = 1e-3
 "#;
 
 fn parse(text: &str, overrides: &[&str]) -> Result<Config, ConfigError> {
-    let overrides = overrides.iter().map(|text| text.parse()).collect::<Result<Vec<_>, _>>()?;
+    let overrides =
+        overrides.iter().map(|text| Override::of_pipeline(text)).collect::<Result<Vec<_>, _>>()?;
     Config::parse("p.toml", text, &overrides)
 }
 
@@ -54,6 +55,18 @@ fn the_resolved_text_gives_the_same_configuration() {
 }
 
 #[test]
+fn the_resolved_text_still_is_the_preset() {
+    for name in gawm_model::objective::PRESETS {
+        let preset = format!("objectives.preset={name}");
+        let config = parse("", &[&preset, "objectives.monitored=[\"straightening\"]"]).unwrap();
+        let again = parse(&config.to_toml(), &[]).unwrap();
+        assert_eq!(again.objectives.preset_name(), Some(name));
+        let weighted = parse("", &[&preset, "objectives.weights.prediction=0.5"]).unwrap();
+        assert_eq!(weighted.objectives.preset_name(), None);
+    }
+}
+
+#[test]
 fn an_empty_file_is_the_published_setting() {
     let config = parse("", &[]).unwrap();
     assert_eq!(config.model, ModelConfig::default());
@@ -72,7 +85,7 @@ fn refused_values_have_place_expected_and_got() {
     check_refused("[loader]\nloaders = 0", &[], &["[loader]", "1 to 1024", "got 0"]);
     check_refused("", &["train.step=3"], &["[train]", "step"]);
     check_refused("", &["train.steps"], &["no `=`"]);
-    check_refused("", &["steps=3"], &["no field"]);
+    check_refused("", &["steps=3"], &["a section of sim"]);
     check_refused("[train]\nsteps = 1", &["train.steps.x=3"], &["steps", "integer"]);
     check_refused("[train", &[], &["line 1"]);
 }

@@ -92,7 +92,13 @@ fn run_folders_are_not_written_over_and_not_shared() {
     assert!(matches!(RunFolder::resume(&run, &config), Err(RunFolderError::NoRun { .. })));
     let first = RunFolder::create(&run, &config).unwrap();
     assert!(matches!(RunFolder::resume(&run, &config), Err(RunFolderError::InUse { .. })));
+    assert!(matches!(RunFolder::create(&run, &config), Err(RunFolderError::InUse { .. })));
     drop(first);
+    // A start that never saw data leaves nothing worth keeping: the next one needs no other folder.
+    RunFolder::create(&run, &other).unwrap();
+    let started = RunFolder::create(&run, &config).unwrap();
+    std::fs::write(started.metrics(), "").unwrap();
+    drop(started);
     assert!(matches!(RunFolder::create(&run, &config), Err(RunFolderError::Exists { .. })));
     match RunFolder::resume(&run, &other) {
         Err(RunFolderError::ConfigDiffers { field, expected, got, .. }) => {

@@ -9,11 +9,15 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use super::ledger::{Ledger, LedgerEntry, LedgerError};
+use gawm_schema::pipeline::SECTIONS;
+
 use super::steps::{Layout, Step, StepName, plan_steps};
-use super::{Pipeline, PipelineError, SECTIONS};
+use super::{Pipeline, PipelineError};
 
 /// Exit code of a program that was interrupted.
 const INTERRUPTED: u8 = 130;
+/// Exit code of a program that was told something wrong.
+const USAGE: u8 = 2;
 /// Exit code of a program that finished with something to look at.
 const WITH_LOSS: u8 = 3;
 /// How often a running step is looked at.
@@ -74,6 +78,14 @@ pub enum RunError {
         /// The cause.
         source: std::io::Error,
     },
+    /// Another pipeline, or a step of one that was killed, works in the folder.
+    #[error(
+        "{path} is locked: another pipeline, or a step of one that was killed, still works in this folder"
+    )]
+    InUse {
+        /// The file that is locked.
+        path: PathBuf,
+    },
     /// There is something in the way that no step of this pipeline made.
     #[error("{path} is there, but no step of this pipeline made it")]
     Foreign {
@@ -95,6 +107,8 @@ pub enum RunError {
         name: &'static str,
         /// `exit code 1`, `signal 9`.
         status: String,
+        /// Whether the step says that it was told something wrong (exit code 2).
+        is_usage: bool,
         /// The command line.
         command: String,
     },
@@ -118,13 +132,20 @@ pub fn run(
     options: &RunOptions,
     say: &mut dyn FnMut(&str),
 ) -> Result<Outcome, RunError> {
+    pipeline.check()?;
     let steps = plan_steps(pipeline, options.out, options.logs)?;
     let layout = Layout::of(options.out);
-    let mut ledger = Ledger::load(&layout.ledger)?;
+    let mut _lock = None;
     if !options.is_dry {
         std::fs::create_dir_all(options.out)
             .map_err(|source| RunError::Io { path: options.out.to_owned(), source })?;
-        let resolved = pipeline.text_of(&SECTIONS);
+        _lock = Some(lock(&layout.lock)?);
+    }
+    let mut ledger = Ledger::load(&layout.ledger)?;
+    if !options.is_dry {
+        let moved =
+            pipeline.moved().map_err(|source| RunError::Io { path: pipeline.path.clone(), source })?;
+        let resolved = moved.text_of(&SECTIONS);
         std::fs::write(&layout.config, resolved)
             .map_err(|source| RunError::Io { path: layout.config.clone(), source })?;
     }
@@ -145,12 +166,27 @@ pub fn run(
             continue;
         }
         say(&head);
-        let entry = run_step(step, can_resume, &mut ledger, &layout, options.program)?;
+        let entry = run_step(step, can_resume, &mut ledger, &layout, options.program, say)?;
         let warning = if entry.exit == WITH_LOSS { ", with something to look at (exit code 3)" } else { "" };
         say(&format!("[{}/{count}] {}: done in {:.1} s{warning}", i + 1, step.name.as_str(), entry.seconds));
         outcome.steps.push(report(step, &entry, false));
     }
     Ok(outcome)
+}
+
+/// Takes the folder of the results for this process and the steps that it starts.
+///
+/// The steps inherit the lock: one that goes on after its pipeline was killed still holds the folder.
+fn lock(path: &Path) -> Result<File, RunError> {
+    let io = |source| RunError::Io { path: path.to_owned(), source };
+    let file = File::options().create(true).append(true).open(path).map_err(io)?;
+    match rustix::fs::flock(&file, rustix::fs::FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => {}
+        Err(rustix::io::Errno::WOULDBLOCK) => return Err(RunError::InUse { path: path.to_owned() }),
+        Err(error) => return Err(io(error.into())),
+    }
+    rustix::io::fcntl_setfd(&file, rustix::io::FdFlags::empty()).map_err(|error| io(error.into()))?;
+    Ok(file)
 }
 
 fn report(step: &Step, entry: &LedgerEntry, was_up_to_date: bool) -> StepReport {
@@ -164,14 +200,18 @@ fn run_step(
     ledger: &mut Ledger,
     layout: &Layout,
     program: &Path,
+    say: &mut dyn FnMut(&str),
 ) -> Result<LedgerEntry, RunError> {
     let name = step.name.as_str();
     let mut arguments = step.arguments.clone();
     if can_resume {
         arguments.extend(step.resume.clone().unwrap_or_default());
     } else {
-        let is_ours = ledger.entry(name).is_some();
-        clear(&step.output, is_ours)?;
+        let earlier = ledger.entry(name);
+        if step.name == StepName::Train && earlier.is_some_and(|entry| entry.is_done) {
+            keep_model(&step.output, say)?;
+        }
+        clear(&step.output, earlier.is_some())?;
     }
     let command = command_line(program, &step.arguments);
     let mut entry = LedgerEntry {
@@ -196,8 +236,22 @@ fn run_step(
             Ok(entry)
         }
         Some(INTERRUPTED) => Err(RunError::Interrupted { name }),
-        _ => Err(RunError::Step { name, status: status.to_string(), command }),
+        code => {
+            Err(RunError::Step { name, status: status.to_string(), is_usage: code == Some(USAGE), command })
+        }
     }
+}
+
+/// Moves a trained model aside: everything else is made again in minutes, a model in hours.
+fn keep_model(output: &Path, say: &mut dyn FnMut(&str)) -> Result<(), RunError> {
+    if !output.exists() {
+        return Ok(());
+    }
+    let aside = (1..).map(|n| output.with_extension(n.to_string())).find(|path| !path.exists());
+    let aside = aside.expect("some number is free");
+    std::fs::rename(output, &aside).map_err(|source| RunError::Io { path: output.to_owned(), source })?;
+    say(&format!("the model trained before is kept in {}", aside.display()));
+    Ok(())
 }
 
 /// Removes what an earlier attempt left; what no step of ours made is not touched.

@@ -3,7 +3,9 @@
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-use super::{Pipeline, PipelineError, SECTIONS};
+use gawm_schema::pipeline::SECTIONS;
+
+use super::{Pipeline, PipelineError};
 
 /// A step of a pipeline, in the order they run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum)]
@@ -71,6 +73,7 @@ pub(crate) struct Layout {
     pub(crate) plan: PathBuf,
     pub(crate) diagnosis: PathBuf,
     pub(crate) ledger: PathBuf,
+    pub(crate) lock: PathBuf,
 }
 
 impl Layout {
@@ -86,6 +89,7 @@ impl Layout {
             plan: out.join("plan"),
             diagnosis: out.join("diagnose"),
             ledger: out.join("pipeline.json"),
+            lock: out.join("pipeline.lock"),
         }
     }
 }
@@ -121,6 +125,9 @@ pub fn plan_steps(pipeline: &Pipeline, out: &Path, logs: &[PathBuf]) -> Result<V
         return Err(missing("ingest"));
     }
     key.add(&pipeline.text_of(&["ingest"]));
+    for file in pipeline.contract_files() {
+        key.add_file(&file)?;
+    }
     steps.push(ingest(&layout, &inputs, key.digest()));
     steps.extend(look(&layout, &key));
     if pipeline.has("train") {
@@ -130,9 +137,13 @@ pub fn plan_steps(pipeline: &Pipeline, out: &Path, logs: &[PathBuf]) -> Result<V
         key.add(&pipeline.text_of(&["loader", "model", "objectives", "train"]));
         steps.push(train(&layout, key.digest()));
         if let Some(eval) = pipeline.document.get("eval") {
-            key.add(&pipeline.text_of(&["eval"]));
-            steps.extend(eval.get("plan").map(|_| plan(&layout, key.digest())));
-            steps.push(diagnose(&layout, key.digest()));
+            let with = |part: &str| {
+                let mut key = Key(key.0.clone());
+                key.add(&eval.get(part).map(toml::Value::to_string).unwrap_or_default());
+                key.digest()
+            };
+            steps.extend(eval.get("plan").map(|_| plan(&layout, with("plan"))));
+            steps.push(diagnose(&layout, with("diagnose")));
         }
     }
     Ok(steps)
@@ -230,6 +241,9 @@ fn evaluate(layout: &Layout, name: StepName, verb: &str, what: &str, output: &Pa
     }
 }
 
+/// How deep folders of logs are looked into; LeRobot's have three levels.
+const MAX_DEPTH: usize = 8;
+
 /// A hash that grows with what is read, step by step: the key of a step covers all steps before it.
 struct Key(blake3::Hasher);
 
@@ -246,29 +260,46 @@ impl Key {
         self.0.update(text.as_bytes());
     }
 
-    /// Adds a log by path, length and time of change: hashing terabytes to find out that nothing changed helps nobody.
+    /// Adds a log, or a folder of them, by name, length and time of change: hashing terabytes to find out that nothing
+    /// changed helps nobody, and the same log by another path is the same log.
     fn add_file(&mut self, path: &Path) -> Result<(), PipelineError> {
         let read = |source| PipelineError::Read { path: path.to_owned(), source };
+        // `logs/.` and `logs` are one folder.
+        let name = path.canonicalize().map_err(read)?;
+        let name = name.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let metadata = std::fs::metadata(path).map_err(read)?;
-        self.add(&path.to_string_lossy());
-        if metadata.is_dir() {
-            let mut entries =
-                std::fs::read_dir(path).map_err(read)?.collect::<Result<Vec<_>, _>>().map_err(read)?;
-            entries.sort_by_key(std::fs::DirEntry::file_name);
-            for entry in entries {
-                self.add_stamp(&entry.path(), &entry.metadata().map_err(read)?);
+        if !metadata.is_dir() {
+            self.add_stamp(&name, &metadata);
+            return Ok(());
+        }
+        self.add(&name);
+        self.add_folder(path, MAX_DEPTH)
+    }
+
+    fn add_folder(&mut self, path: &Path, depth: usize) -> Result<(), PipelineError> {
+        let read = |source| PipelineError::Read { path: path.to_owned(), source };
+        let mut entries =
+            std::fs::read_dir(path).map_err(read)?.collect::<Result<Vec<_>, _>>().map_err(read)?;
+        entries.sort_by_key(std::fs::DirEntry::file_name);
+        self.add(&entries.len().to_string());
+        for entry in entries {
+            let metadata = entry.metadata().map_err(read)?;
+            let name = entry.file_name().to_string_lossy().into_owned();
+            if metadata.is_dir() && depth > 0 {
+                self.add(&name);
+                self.add_folder(&entry.path(), depth - 1)?;
+            } else {
+                self.add_stamp(&name, &metadata);
             }
-        } else {
-            self.add_stamp(path, &metadata);
         }
         Ok(())
     }
 
-    fn add_stamp(&mut self, path: &Path, metadata: &std::fs::Metadata) {
+    fn add_stamp(&mut self, name: &str, metadata: &std::fs::Metadata) {
         let changed =
             metadata.modified().ok().and_then(|time| time.duration_since(std::time::UNIX_EPOCH).ok());
         let changed_ns = changed.map_or(0, |time| time.as_nanos());
-        self.add(&format!("{} {} {changed_ns}", path.display(), metadata.len()));
+        self.add(&format!("{name} {} {changed_ns}", metadata.len()));
     }
 
     fn digest(&self) -> String {

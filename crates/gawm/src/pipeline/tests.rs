@@ -64,3 +64,35 @@ fn a_change_makes_the_steps_that_read_it_and_those_after_them_due() {
     assert_eq!(same_until(&["ingest.version=2"]), [Collect]);
     assert_eq!(same_until(&["sim.seed=2"]), []);
 }
+
+#[test]
+fn planning_and_diagnosis_are_due_each_for_its_own_part() {
+    let text = format!("{TEXT}{TRAINED}[eval.plan]\ncount = 5\n");
+    let of = |overrides: &[&str]| keys(&pipeline(&text, overrides).unwrap());
+    let (before, planned, examined) = (of(&[]), of(&["eval.plan.count=6"]), of(&["eval.diagnose.stride=2"]));
+    let due = |after: &[(StepName, String)]| -> Vec<StepName> {
+        before.iter().zip(after).filter(|(a, b)| a != b).map(|(a, _)| a.0).collect()
+    };
+    assert_eq!(due(&planned), [StepName::Plan]);
+    assert_eq!(due(&examined), [StepName::Diagnose]);
+}
+
+#[test]
+fn a_log_is_the_same_log_by_any_path() {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, nested) = (folder.path().join("a.mcap"), folder.path().join("bag/deep"));
+    std::fs::create_dir_all(&nested).unwrap();
+    std::fs::write(&log, "one").unwrap();
+    std::fs::write(nested.join("part"), "one").unwrap();
+    let pipeline = pipeline(TEXT, &[]).unwrap();
+    let key = |path: &Path| {
+        let steps = plan_steps(&pipeline, Path::new("out"), &[path.to_owned()]).unwrap();
+        steps.into_iter().map(|step| step.key).collect::<Vec<_>>()
+    };
+    assert_eq!(key(&log), key(&folder.path().join("bag/../a.mcap")));
+    let bag = folder.path().join("bag");
+    let before = key(&bag);
+    assert_eq!(before, key(&bag.join(".")));
+    std::fs::write(nested.join("part"), "more").unwrap();
+    assert_ne!(before, key(&bag));
+}

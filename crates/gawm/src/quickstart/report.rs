@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use gawm_eval::figures::{Line, Page, lines, plan_page};
-use gawm_eval::suite::{PlanReport, Solver};
+use gawm_eval::suite::{PlanReport, Rate, SetResult, Solver};
 use serde_json::Value;
 
 use super::{QuickstartError, Summary, read, read_json};
@@ -23,10 +23,10 @@ pub(super) fn page(
 ) -> Result<String, QuickstartError> {
     let mut page = Page::new("A world model of TwoRoom, from raw logs");
     page.note(&summary.verdict);
-    page.table(&headline(summary));
+    page.table(&headline(plan));
     page.note(
-        "Success is a fraction of the problems, counted when the agent is within 16 px of the goal after any step. \
-         A rate means nothing without its floors: a straight line that ignores the wall solves most problems of TwoRoom, \
+        "Success is a share of the problems, with its 95 % interval, counted when the agent is within 16 px of the goal \
+         after any step. A rate means nothing without its floors: a straight line that ignores the wall solves most problems of TwoRoom, \
          so the wall set holds only those that it fails.",
     );
     steps(&mut page, outcome, summary);
@@ -44,20 +44,33 @@ pub(super) fn page(
     Ok(page.finish())
 }
 
-fn headline(summary: &Summary) -> Vec<Vec<String>> {
-    let percent = |fraction: f64| format!("{:.0} %", 100.0 * fraction);
-    let row = |name: &str, plain: Option<f64>, wall: Option<f64>| {
-        let cell = |value: Option<f64>| value.map_or_else(|| "-".to_owned(), percent);
-        vec![name.to_owned(), cell(plain), cell(wall)]
+/// The model, its floors and the ceiling on every set.
+fn headline(plan: &PlanReport) -> Vec<Vec<String>> {
+    let solvers = [
+        ("the model", Solver::Model),
+        ("floor: nothing", Solver::NoOp),
+        ("floor: random", Solver::Random),
+        ("floor: straight line", Solver::StraightLine),
+        ("floor: untrained encoder", Solver::Untrained),
+        ("floor: search blind for the wall", Solver::WallBlind),
+        ("ceiling: search that knows the dynamics", Solver::TrueDynamics),
+    ];
+    let set_name = |name: &str| match name {
+        "wall" => "problems that need the door".to_owned(),
+        name => format!("{name} problems"),
     };
-    vec![
-        ["solver", "non-trivial problems", "problems that need the door"].map(str::to_owned).to_vec(),
-        row("the model", Some(summary.success), Some(summary.wall_success)),
-        row("floor: nothing", Some(summary.floor_noop), None),
-        row("floor: random", Some(summary.floor_random), None),
-        row("floor: straight line", Some(summary.floor_straight), Some(0.0)),
-        row("floor: search blind for the wall", None, Some(summary.wall_floor_blind)),
-    ]
+    let head = plan.sets.iter().map(|set| format!("{}, n = {}", set_name(&set.name), set.n));
+    let mut rows = vec![std::iter::once("solver".to_owned()).chain(head).collect()];
+    for (name, solver) in solvers {
+        let cell = |set: &SetResult| {
+            let Rate { rate, interval, .. } = set.solver(solver)?.any;
+            let [rate, low, high] = [rate, interval.low, interval.high].map(|fraction| 100.0 * fraction);
+            Some(format!("{rate:.0} % [{low:.0}, {high:.0}]"))
+        };
+        let cells = plan.sets.iter().map(|set| cell(set).unwrap_or_else(|| "-".to_owned()));
+        rows.push(std::iter::once(name.to_owned()).chain(cells).collect());
+    }
+    rows
 }
 
 fn steps(page: &mut Page, outcome: &Outcome, summary: &Summary) {
@@ -75,10 +88,15 @@ fn data(page: &mut Page, layout: &Layout) -> Result<(), QuickstartError> {
     let info: Value = read_json(&layout.dataset.join("meta/info.json"))?;
     let validation: Value = read_json(&layout.validation)?;
     page.heading("The data");
-    let findings = validation["findings"].as_array().map_or(0, Vec::len);
+    let findings = validation["findings"].as_array();
+    let count = |severity: &str| {
+        let is = |finding: &&Value| finding["severity"] == severity;
+        findings.map_or(0, |findings| findings.iter().filter(is).count())
+    };
+    let (errors, warnings) = (count("error"), count("warning"));
     page.note(&format!(
-        "{} episodes, {} frames at {} Hz, ingested from MCAP logs; validation has {findings} findings. \
-         dataset.html shows every stream and episode.",
+        "{} episodes, {} frames at {} Hz, ingested from MCAP logs; validation has {errors} errors and {warnings} warnings \
+         (validation.json; docs/validation.md says what they mean). dataset.html shows every stream and episode.",
         info["total_episodes"], info["total_frames"], info["fps"]
     ));
     Ok(())
@@ -112,7 +130,7 @@ fn curves(page: &mut Page, layout: &Layout) -> Result<(), QuickstartError> {
         series("with shuffled actions", &|record| skill(record["skill_shuffled_actions"].as_f64())),
     ];
     page.figure(&lines(
-        "Skill of the prediction",
+        "Skill of the prediction, cut off at -1",
         ("step", "skill"),
         &skills,
         &[0.0],
@@ -126,7 +144,13 @@ fn curves(page: &mut Page, layout: &Layout) -> Result<(), QuickstartError> {
         series("state", &|record| skill(of_term(record, "state-alignment"))),
         series("action", &|record| skill(of_term(record, "inverse-dynamics"))),
     ];
-    page.figure(&lines("Skill of the heads", ("step", "skill"), &heads, &[0.0], Some((LOWEST_SKILL, 1.0))));
+    page.figure(&lines(
+        "Skill of the heads, cut off at -1",
+        ("step", "skill"),
+        &heads,
+        &[0.0],
+        Some((LOWEST_SKILL, 1.0)),
+    ));
     let rank = [series("effective rank", &|record| record["effective_rank"].as_f64())];
     page.figure(&lines("Effective rank of the latents", ("step", "rank"), &rank, &[1.0], None));
     Ok(())

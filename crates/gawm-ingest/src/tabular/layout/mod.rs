@@ -19,6 +19,7 @@ mod terminals;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::column::Column;
@@ -27,7 +28,7 @@ use super::finding::{Finding, FindingKind};
 use super::{Table, Values};
 
 /// A way to lay episodes out; stated in a contract as `{ kind = "groups", parent = "data", prefix = "demo_" }`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Layout {
     /// Rows of all episodes one after another, with the episodes' lengths and first rows.
