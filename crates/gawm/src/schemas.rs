@@ -46,9 +46,17 @@ fn pipeline() -> Value {
         of::<gawm_train::config::TrainConfig>(),
         of::<gawm_eval::config::EvalConfig>(),
     ];
-    let sections = gawm_schema::pipeline::SECTIONS.into_iter().zip(sections);
-    let properties: Map<String, Value> = sections.map(|(name, section)| (name.to_owned(), section)).collect();
-    json!({ "type": "object", "properties": properties, "additionalProperties": false })
+    let (mut properties, mut definitions) = (Map::new(), Map::new());
+    for (name, mut section) in gawm_schema::pipeline::SECTIONS.into_iter().zip(sections) {
+        // References count from the root of the file.
+        if let Some(Value::Object(named)) =
+            section.as_object_mut().and_then(|body| body.shift_remove("$defs"))
+        {
+            definitions.extend(named);
+        }
+        properties.insert(name.to_owned(), section);
+    }
+    json!({ "type": "object", "properties": properties, "additionalProperties": false, "$defs": definitions })
 }
 
 fn of<T: JsonSchema>() -> Value {

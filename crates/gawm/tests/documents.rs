@@ -81,12 +81,12 @@ fn check_current(file: &str, made: &str) {
 fn objections(schema: &Value, text: &str) -> Vec<String> {
     let table: toml::Table = text.parse().unwrap();
     let mut found = Vec::new();
-    object(schema, &serde_json::to_value(table).unwrap(), "", &mut found);
+    object(&schema["$defs"], schema, &serde_json::to_value(table).unwrap(), "", &mut found);
     found
 }
 
 /// Checks a value by the keywords that our schemas have; another one fails the test.
-fn object(schema: &Value, value: &Value, place: &str, found: &mut Vec<String>) {
+fn object(named: &Value, schema: &Value, value: &Value, place: &str, found: &mut Vec<String>) {
     if let Value::Bool(any) = schema {
         found.extend((!any).then(|| format!("{place}: unknown")));
         return;
@@ -117,27 +117,31 @@ fn object(schema: &Value, value: &Value, place: &str, found: &mut Vec<String>) {
                     expect(value.get(name.as_str().unwrap()).is_some(), format!("{name} is missing"));
                 }
             }
-            "$schema" | "title" | "description" | "default" | "format" => {}
+            "$schema" | "$defs" | "$ref" | "title" | "description" | "default" | "format" => {}
             "properties" | "additionalProperties" | "items" | "anyOf" | "oneOf" => {}
-            other => panic!("{place}: keyword {other}: {schema}"),
+            other => panic!("{place}: keyword {other}"),
         }
+    }
+    if let Some(name) = body.get("$ref").map(|rule| rule.as_str().unwrap().strip_prefix("#/$defs/").unwrap())
+    {
+        object(named, &named[name], value, place, found);
     }
     for (name, inner) in value.as_object().into_iter().flatten() {
         let known = body.get("properties").and_then(|properties| properties.get(name));
         if let Some(rule) = known.or(body.get("additionalProperties")) {
-            object(rule, inner, &format!("{place}.{name}"), found);
+            object(named, rule, inner, &format!("{place}.{name}"), found);
         }
     }
     for (index, inner) in value.as_array().into_iter().flatten().enumerate() {
         if let Some(rule) = body.get("items") {
-            object(rule, inner, &format!("{place}[{index}]"), found);
+            object(named, rule, inner, &format!("{place}[{index}]"), found);
         }
     }
     for choice in ["anyOf", "oneOf"] {
         let Some(choices) = body.get(choice).and_then(Value::as_array) else { continue };
         let fits = |one: &&Value| {
             let mut against = Vec::new();
-            object(one, value, place, &mut against);
+            object(named, one, value, place, &mut against);
             against.is_empty()
         };
         let fitting = choices.iter().filter(fits).count();

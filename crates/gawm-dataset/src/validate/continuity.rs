@@ -88,7 +88,7 @@ fn longest_still(run: &RunProfile, camera: &CameraRun, reach: usize) -> Option<(
     let speed = relative_speed(run).filter(|s| s.len() == frames.len())?;
     let moving = (reach..frames.len()).filter(|t| speed[*t] > 0.5);
     let usual = median(&moving.map(|t| distance(&frames[t - reach], &frames[t])).collect::<Vec<_>>());
-    if frames.len() < 3 * reach || usual.is_nan() || usual < VISIBLE {
+    if frames.len() < reach.saturating_mul(3) || usual.is_nan() || usual < VISIBLE {
         return None;
     }
     let (mut longest, mut start) = (Stretch::default(), 0);

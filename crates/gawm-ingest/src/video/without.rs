@@ -24,7 +24,7 @@ impl PacketDecoder {
 
 /// Reads no files.
 #[derive(Debug, Default)]
-pub(crate) struct VideoLanes;
+pub(crate) struct VideoLanes {}
 
 impl VideoLanes {
     pub(crate) fn read(

@@ -220,7 +220,7 @@ impl Hello {
         }
         let scales = self.state.dims.iter().chain(&self.action.dims);
         if let Some(dim) =
-            scales.into_iter().find(|d| !(d.scale.is_normal() && d.scale > 0.0) || !d.mean.is_finite())
+            scales.into_iter().find(|d| !(d.scale.is_normal() && d.scale > 0.0 && d.mean.is_finite()))
         {
             let got = format!("{} with mean {} and scale {}", dim.name, dim.mean, dim.scale);
             let expected = "finite, the scale above 0".to_owned();

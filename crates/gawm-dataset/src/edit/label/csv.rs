@@ -61,8 +61,7 @@ impl Reader<'_> {
     }
 
     fn plain_cell(&mut self) -> Result<String, (u64, String)> {
-        let end =
-            self.text.find(|c| c == self.delimiter || c == '\n' || c == '\r').unwrap_or(self.text.len());
+        let end = self.text.find([self.delimiter, '\n', '\r']).unwrap_or(self.text.len());
         let (cell, rest) = self.text.split_at(end);
         if cell.contains('"') {
             let detail =
