@@ -45,7 +45,14 @@ LOGS = {
 }
 FOLDERS = ["lerobot_v2_gr1_picknplace", "lerobot_v3_apple_storage"]
 # What is true of the data, by dataset and code, and why.
-TRUE = {}
+TRUE = {
+    "SEMANTIC-006": "no task text",
+    "SEMANTIC-013": "episodes of 21 to 28 rows hold few windows of 16",
+    "VALUE-009": "quaternions change their sign",
+    "IMAGE-011": "a feature without files",
+    "SPLIT-004": "`info.json` of the whole dataset beside a part of it",
+    "STRUCT-013": "`info.json` of the whole dataset beside a part of it",
+}
 
 
 def run(*command):
@@ -101,10 +108,10 @@ def main():
             rows.append(f"| `{name}` | not read: {done.stderr[:200]} | | |")
             continue
         loud = [f for f in report["findings"] if f["severity"] in ("warning", "error")]
-        true = [f for f in loud if (name, f["code"]) in TRUE]
-        false = [f for f in loud if (name, f["code"]) not in TRUE]
+        true = [f for f in loud if f["code"] in TRUE]
+        false = [f for f in loud if f["code"] not in TRUE]
         total += len(false)
-        texts = {f["code"]: TRUE[name, f["code"]] for f in true}
+        texts = {f["code"]: TRUE[f["code"]] for f in true}
         said = "; ".join(f"{code}: {text}" for code, text in sorted(texts.items()))
         wrong = ", ".join(f"{code} x {n}" for code, n in sorted(Counter(f["code"] for f in false).items()))
         n_info = report["counts"]["info"]
