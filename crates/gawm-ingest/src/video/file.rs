@@ -95,8 +95,7 @@ impl VideoFile {
             self.seek(wanted_secs)?;
         }
         let mut nearest: Option<f64> = None;
-        loop {
-            let Some(secs) = self.fill(wanted_secs)? else { break };
+        while let Some(secs) = self.fill(wanted_secs)? {
             let distance = (secs - wanted_secs).abs();
             if distance <= TOLERANCE_SECS {
                 if self.ready.front().is_some_and(RawFrame::is_damaged) {

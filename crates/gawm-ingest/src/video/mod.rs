@@ -22,9 +22,11 @@ mod packets;
 #[cfg(not(feature = "video"))]
 mod without;
 
-#[cfg(all(test, feature = "video"))]
+#[cfg(test)]
+#[cfg(feature = "video")]
 mod run_tests;
-#[cfg(all(test, feature = "video"))]
+#[cfg(test)]
+#[cfg(feature = "video")]
 mod tests;
 
 use bytes::Bytes;
