@@ -22,7 +22,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-use crate::contract::Contract;
+use crate::contract::{Contract, LabelSource};
 use crate::decode::SchemaLibrary;
 use crate::lerobot::{self, LerobotRecording};
 use crate::log::{OpenLogError, OpenOptions, discover};
@@ -99,7 +99,23 @@ pub fn suggest(
     measure::refine(&mut suggestion, &survey, library);
     episodes::guess(&mut suggestion, &survey);
     stream_names::name_streams(&mut suggestion.contract);
+    remove_used(&mut suggestion);
     Ok(suggestion)
+}
+
+/// Topics that labels, episodes or calibrations come from are used, though they are no columns.
+fn remove_used(suggestion: &mut Suggestion) {
+    let contract = &suggestion.contract;
+    let labels = &contract.labels;
+    let of_labels = [&labels.task, &labels.success, &labels.operator, &labels.robot, &labels.session];
+    let of_labels = of_labels.into_iter().flatten().filter_map(|source| match source {
+        LabelSource::Topic(label) => Some(&label.topic),
+        _ => None,
+    });
+    let infos = contract.stream.iter().filter_map(|stream| stream.image.as_ref()?.camera_info.as_ref());
+    let used: Vec<String> =
+        of_labels.chain(&contract.episodes.topic).chain(infos).map(|topic| format!("{topic} (")).collect();
+    suggestion.unmapped.retain(|line| !used.iter().any(|topic| line.starts_with(topic)));
 }
 
 /// Suggests from the first input, if that is a table or a LeRobot folder.

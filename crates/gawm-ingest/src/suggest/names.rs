@@ -68,7 +68,21 @@ pub(crate) fn is_velocity(name: &str) -> bool {
 }
 
 pub(crate) fn is_recording(name: &str) -> bool {
-    has(name, &["recording", "record", "episode", "episodes", "is_recording", "rec", "trial", "demo"])
+    let words = [
+        "recording",
+        "recorder",
+        "record",
+        "rec",
+        "episode",
+        "episodes",
+        "trial",
+        "trials",
+        "demo",
+        "demonstration",
+        "rollout",
+        "rollouts",
+    ];
+    has(name, &words)
 }
 
 pub(crate) fn is_reward(name: &str) -> bool {
