@@ -365,13 +365,8 @@ fn kind_of(topic: &Topic, field: &FieldInfo) -> (KindSpec, Option<String>, Strin
         return (KindSpec::Bool, None, "truth values".to_owned());
     }
     if names::is_gripper(&field.path) || names::is_gripper(&topic.channel.topic) {
-        let unit = if field.path.ends_with("_m") {
-            some("m")
-        } else if field.path.ends_with("_n") {
-            some("N")
-        } else {
-            None
-        };
+        let unit = if field.path.ends_with("_n") { Some("N") } else { names::unit_of(&field.path) };
+        let unit = unit.map(str::to_owned);
         if unit.as_deref() != Some("N") {
             return (KindSpec::Gripper, unit, "named as a gripper".to_owned());
         }
@@ -398,8 +393,7 @@ fn kind_of(topic: &Topic, field: &FieldInfo) -> (KindSpec, Option<String>, Strin
         () if field.path.ends_with("_deg") => {
             return (KindSpec::Angle, some("deg"), "an angle by its name".to_owned());
         }
-        () if field.path.ends_with("_m") => some("m"),
-        () => None,
+        () => names::unit_of(&field.path).map(str::to_owned),
     };
     let reason =
         if unit.is_some() { "unit by type and name" } else { "unit unknown: say `unit` if you know it" };

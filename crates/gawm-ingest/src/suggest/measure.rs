@@ -171,8 +171,9 @@ fn time_actions(suggestion: &mut Suggestion, survey: &Survey, series: &StreamSer
             let among = if own.is_empty() { places.iter().map(|(place, _)| *place).collect() } else { own };
             best_state(&columns[at], &among, series)
         };
+        let is_measured = |at: usize| at < MAX_COLUMNS && stream.kind != KindSpec::Bool;
         let followed: Vec<Option<Follower>> =
-            (0..columns.len()).map(|at| (at < MAX_COLUMNS).then(|| follower(at)).flatten()).collect();
+            (0..columns.len()).map(|at| is_measured(at).then(|| follower(at)).flatten()).collect();
         let lags = followed.iter().flatten().map(|follower| follower.following.lag_s * 1e3);
         lags_of.entry(topic).or_default().extend(lags);
         followers.insert(index, followed);
@@ -254,6 +255,13 @@ fn best_state(command: &Series, places: &[Place], series: &StreamSeries) -> Opti
         .filter(|best| best.following.correlation >= MIN_CORRELATION)
 }
 
+/// Returns the upper median; 0 of nothing.
+fn median(values: &[f64]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted.get(sorted.len() / 2).copied().unwrap_or(0.0)
+}
+
 /// Sets offset and timing.
 fn apply(
     stream: &mut StreamSpec,
@@ -268,11 +276,9 @@ fn apply(
     let is_velocity = is_velocity(stream, n_velocity, found.len());
     let is_told = 2 * found.len() >= n_columns.max(1);
     if is_told {
-        let mut lags = measured.lags_ms.to_vec();
-        lags.sort_by(f64::total_cmp);
         // A step acts over the period after its command, so what is measured is later by half a period.
         let half_ms = if is_delta && rate_hz > 0.0 { 500.0 / rate_hz } else { 0.0 };
-        let lag_ms = (lags.get(lags.len() / 2).copied().unwrap_or(0.0) - half_ms).max(0.0);
+        let lag_ms = (median(measured.lags_ms) - half_ms).max(0.0);
         let correlation = found.iter().map(|(_, f)| f.correlation).fold(f64::INFINITY, f64::min);
         let what = if is_delta {
             "step"
@@ -286,6 +292,10 @@ fn apply(
             "offset: the state follows this {what} command after {lag_ms:.1} ms (correlation of {} of {n_columns} columns at least {correlation:.2}), so it acts that much later",
             found.len()
         ));
+    } else if stream.kind == KindSpec::Bool && !measured.lags_ms.is_empty() {
+        let lag_ms = median(measured.lags_ms);
+        stream.offset_ms = if lag_ms >= 1.0 { (lag_ms * 10.0).round() / 10.0 } else { 0.0 };
+        reasons.push("offset: that of the other values of its message".to_owned());
     } else {
         reasons.push(
             "offset: no clear delay between this command and the state; 0 until you know better".to_owned(),
