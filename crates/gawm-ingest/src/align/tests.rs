@@ -124,8 +124,8 @@ fn check_all_masked(ticks: Ticks, samples: &[(usize, f64, f64)], expected: &[Vec
 fn rows_of_masked_streams_begin_with_the_first_sample() {
     let fixed = Ticks::Fixed { rate_hz: 100.0 };
     let samples = [steps(0, 20.0, 50.0, 10.0), steps(1, 40.0, 60.0, 10.0)].concat();
-    check_all_masked(fixed.clone(), &samples, &[(20..=60).step_by(10).collect()]);
-    check_all_masked(fixed.clone(), &steps(1, 7.0, 27.0, 10.0), &[vec![7, 17, 27]]);
+    check_all_masked(fixed, &samples, &[(20..=60).step_by(10).collect()]);
+    check_all_masked(fixed, &steps(1, 7.0, 27.0, 10.0), &[vec![7, 17, 27]]);
     check_all_masked(fixed, &[], &[]);
     check_all_masked(Ticks::Reference { stream: 1 }, &samples, &[vec![40, 50, 60]]);
 }

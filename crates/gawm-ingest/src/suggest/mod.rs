@@ -164,8 +164,11 @@ fn leaf_of(field: &str) -> String {
     let mut leaf = String::new();
     for segment in path.segments() {
         match segment {
-            Segment::Field(name) if leaf.is_empty() => leaf.push_str(name),
-            Segment::Field(name) => leaf.extend([".", name]),
+            // Odd names are in quotes there too.
+            Segment::Field(_) => {
+                let name = FieldPath::from_segments(vec![segment.clone()]).to_string();
+                leaf.extend([if leaf.is_empty() { "" } else { "." }, &name]);
+            }
             _ => leaf.push_str("[]"),
         }
     }
