@@ -16,7 +16,7 @@ mod validate;
 
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 
 use crate::edit::EditError;
 
@@ -50,6 +50,11 @@ enum Verb {
     Split(split::SplitArguments),
     Diff(diff::DiffArguments),
     Standardize(standardize::StandardizeArguments),
+    /// Print completions for a shell
+    Completions {
+        /// Shell
+        shell: clap_complete::Shell,
+    },
 }
 
 /// Runs the program and returns its exit code.
@@ -80,6 +85,7 @@ pub fn run(arguments: impl IntoIterator<Item = std::ffi::OsString>) -> ExitCode 
         Verb::Split(verb) => split::run(verb, quiet),
         Verb::Diff(verb) => diff::run(verb, quiet),
         Verb::Standardize(verb) => standardize::run(verb),
+        Verb::Completions { shell } => completions(*shell),
     };
     match outcome {
         Ok(code) => ExitCode::from(code),
@@ -91,6 +97,13 @@ pub fn run(arguments: impl IntoIterator<Item = std::ffi::OsString>) -> ExitCode 
             ExitCode::from(failure.code)
         }
     }
+}
+
+fn completions(shell: clap_complete::Shell) -> Result<u8, Failure> {
+    let mut script = Vec::new();
+    clap_complete::generate(shell, &mut Arguments::command(), "gawm-data", &mut script);
+    print_result(&String::from_utf8_lossy(&script))?;
+    Ok(0)
 }
 
 /// An error with its exit code and what to do.
@@ -154,7 +167,11 @@ pub(crate) fn write_replacing(path: &std::path::Path, bytes: &[u8]) -> std::io::
     // The parent of a bare name is empty.
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
     let folder = folder.unwrap_or_else(|| std::path::Path::new("."));
-    let mut file = tempfile::NamedTempFile::new_in(folder)?;
+    let mut builder = tempfile::Builder::new();
+    // Readable to whom other new files are: temporary ones are private.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    let mut file = builder.tempfile_in(folder)?;
     file.write_all(bytes)?;
     file.as_file().sync_all()?;
     file.persist(path)?;
