@@ -1,5 +1,13 @@
 //! The command line of `gawm-data`.
 
+/// Writes a line to standard error, where one may be gone: `2>&1 | head` is no reason to panic.
+macro_rules! say {
+    ($($text:tt)*) => {{
+        use std::io::Write;
+        writeln!(std::io::stderr(), $($text)*).ok();
+    }};
+}
+
 mod diff;
 mod edit;
 mod filter;
@@ -50,9 +58,9 @@ enum Verb {
     Split(split::SplitArguments),
     Diff(diff::DiffArguments),
     Standardize(standardize::StandardizeArguments),
-    /// Print completions for a shell
+    /// Print a completion script for a shell
     Completions {
-        /// Shell
+        /// The shell
         shell: clap_complete::Shell,
     },
 }
@@ -84,15 +92,15 @@ pub fn run(arguments: impl IntoIterator<Item = std::ffi::OsString>) -> ExitCode 
         Verb::Merge(verb) => merge::run(verb, quiet),
         Verb::Split(verb) => split::run(verb, quiet),
         Verb::Diff(verb) => diff::run(verb, quiet),
-        Verb::Standardize(verb) => standardize::run(verb),
+        Verb::Standardize(verb) => standardize::run(verb, quiet),
         Verb::Completions { shell } => completions(*shell),
     };
     match outcome {
         Ok(code) => ExitCode::from(code),
         Err(failure) => {
-            eprintln!("error: {:#}", failure.error);
+            say!("error: {:#}", failure.error);
             if let Some(hint) = failure.hint {
-                eprintln!("\nhint: {hint}");
+                say!("\nhint: {hint}");
             }
             ExitCode::from(failure.code)
         }
