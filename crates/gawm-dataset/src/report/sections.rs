@@ -392,3 +392,21 @@ pub(super) fn embedded(frame: &FrameBytes) -> Option<String> {
     let jpeg = encode_jpeg(&small.to_image().ok()?, 75).ok()?;
     Some(format!("data:image/jpeg;base64,{}", base64::engine::general_purpose::STANDARD.encode(jpeg)))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check_shared(text: &str, expected: &str) {
+        assert_eq!(shared(text), expected);
+    }
+
+    #[test]
+    fn paths_addresses_and_hosts_are_left_out() {
+        check_shared("meta/info.json: expected 3 / 4 episodes", "meta/info.json: expected 3 / 4 episodes");
+        check_shared("file \"/home/joe/a.mcap\", row 3", "file (path) row 3");
+        check_shared("from path=/data/x and C:\\logs and \\\\nas\\logs", "from (path) and (path) and (path)");
+        check_shared("s3://bucket/x of joe@lab.org on pc7.local.", "(path) of (path) on (path)");
+        check_shared("session \"monday of joe\" is on both sides", "a session is on both sides");
+    }
+}
