@@ -15,7 +15,7 @@ use parquet::arrow::arrow_reader::{
 use rayon::prelude::*;
 
 use super::{
-    Column, DType, Defect, DefectKind, EpisodeEntry, FeatureDecl, Info, ReadLimits,
+    Column, DType, Defect, DefectKind, EpisodeEntry, FeatureDecl, Info, ReadLimits, declared,
     paths::{self, TemplateValues},
 };
 
@@ -69,6 +69,7 @@ pub(crate) fn open_parquet(path: &Path) -> Result<(File, ArrowReaderMetadata), S
         return Err("something that is not a regular file".to_owned());
     }
     let size = size.len();
+    declared::check_schema(&file, size)?;
     let metadata =
         guarded(|| ArrowReaderMetadata::load(&file, ArrowReaderOptions::new()).map_err(|e| e.to_string()))?;
     let mut n_rows: i64 = 0;
@@ -95,6 +96,7 @@ pub(crate) fn open_parquet(path: &Path) -> Result<(File, ArrowReaderMetadata), S
             }
         }
     }
+    declared::check_rows(n_rows, size)?;
     if n_rows != metadata.metadata().file_metadata().num_rows() {
         let declared = metadata.metadata().file_metadata().num_rows();
         return Err(format!("a footer of {declared} rows whose row groups have {n_rows}"));
@@ -371,8 +373,9 @@ fn runs_of_file(
     let mut runs: Vec<(i64, u64)> = Vec::new();
     guarded(|| {
         let (handle, metadata) = open_parquet(&file.path)?;
+        let mask = ProjectionMask::columns(metadata.parquet_schema(), ["episode_index"]);
+        declared::check_pages(&handle, metadata.metadata(), 0..file.row_groups.len(), &mask)?;
         let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(handle, metadata);
-        let mask = ProjectionMask::columns(builder.parquet_schema(), ["episode_index"]);
         let reader =
             builder.with_projection(mask).with_batch_size(65_536).build().map_err(|e| e.to_string())?;
         for batch in reader {
