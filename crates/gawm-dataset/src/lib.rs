@@ -47,6 +47,7 @@ mod block;
 mod camera;
 pub mod cli;
 mod columns;
+pub mod csv;
 mod data_file;
 mod durable;
 pub mod edit;

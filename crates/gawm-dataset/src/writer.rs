@@ -2,6 +2,7 @@
 
 mod attachments;
 mod contract;
+mod discard;
 mod episode_rows;
 mod finish;
 mod open;
@@ -57,6 +58,10 @@ pub struct DatasetWriter {
     /// Recordings, episodes and rows that this run did not add.
     before: (u64, u64, u64),
     recording: Option<OpenRecording>,
+    /// Whether the folder held nothing before this run, or before the one that it resumes.
+    is_first: bool,
+    /// Whether this run made the folder.
+    has_made_folder: bool,
 }
 
 /// A recording that has begun and not ended.
@@ -89,6 +94,11 @@ impl DatasetWriter {
     /// Returns the schema that rows must fit.
     pub fn schema(&self) -> &gawm_schema::Schema {
         &self.spec.schema
+    }
+
+    /// Returns whether any episode has ended, in this run or before.
+    pub fn has_episodes(&self) -> bool {
+        !self.episodes.is_empty()
     }
 
     /// Begins a recording, unless the dataset has it.

@@ -4,7 +4,6 @@
 //! task. All other bytes are linked, or copied; images are never encoded again. A LeRobot folder goes the way of the
 //! other verbs and becomes LeRobot v3.0.
 
-mod csv;
 mod error;
 mod rewrite;
 mod splice;

@@ -54,6 +54,7 @@ impl DatasetWriter {
             }
             _ => {}
         }
+        let has_made_folder = !dir.exists();
         fs::create_dir_all(dir).map_err(WriteError::io("create", dir))?;
         let (journal, found, done) = if is_unfinished {
             let (journal, run, done) = Journal::open(dir, &disk)?;
@@ -70,7 +71,10 @@ impl DatasetWriter {
                 RunRecord { format_version: FORMAT_VERSION, spec: spec.clone(), base: found.base.clone() };
             (Journal::begin(dir, &disk, &run)?, found, Vec::new())
         };
-        let writer = DatasetWriter::with_content(dir, disk, spec, journal, found, done)?;
+        let is_first = !is_finished && found.base.recordings == 0;
+        let mut writer = DatasetWriter::with_content(dir, disk, spec, journal, found, done)?;
+        writer.is_first = is_first;
+        writer.has_made_folder = has_made_folder;
         writer.remove_leftovers()?;
         Ok(writer)
     }
@@ -128,12 +132,14 @@ impl DatasetWriter {
             cameras,
             before,
             recording: None,
+            is_first: false,
+            has_made_folder: false,
             spec,
         })
     }
 
     /// Removes what an interrupted run left of a recording that it did not finish.
-    fn remove_leftovers(&self) -> Result<(), WriteError> {
+    pub(super) fn remove_leftovers(&self) -> Result<(), WriteError> {
         let files = self.meta.recordings.iter().flat_map(|recording| &recording.files);
         let kept: BTreeSet<PathBuf> =
             files.map(|file| temporary(&self.dir.join(data_path(file.number)))).collect();

@@ -412,6 +412,55 @@ fn a_discarded_episode_and_an_aborted_recording_leave_no_trace() {
     write_all(&c, WriteMode::Append, &[1], 300);
 }
 
+/// Gives up a run after a few steps; the folder is then as it was.
+fn check_discarded(has_folder: bool, other_file: bool, steps: impl FnOnce(&mut DatasetWriter)) {
+    let root = tempfile::tempdir().unwrap();
+    let dir = root.path().join("out");
+    if has_folder {
+        std::fs::create_dir(&dir).unwrap();
+    }
+    let mut writer = DatasetWriter::create(&dir, spec(), WriteMode::New).unwrap();
+    steps(&mut writer);
+    if other_file {
+        std::fs::write(dir.join("data/notes.txt"), "mine").unwrap();
+    }
+    assert!(writer.discard().unwrap());
+    assert_eq!(dir.exists(), has_folder || other_file);
+    let left: Vec<String> = if dir.exists() { tree(&dir).into_keys().collect() } else { Vec::new() };
+    assert_eq!(left, if other_file { vec!["data/notes.txt"] } else { Vec::new() });
+}
+
+#[test]
+fn a_run_that_made_nothing_is_given_up_without_a_trace() {
+    let part = |writer: &mut DatasetWriter| {
+        writer.begin_recording(recording(0)).unwrap();
+        writer.add_attachment("a.urdf", b"x").unwrap();
+        writer.begin_episode(EpisodeInfo::default()).unwrap();
+        writer.write(Trajectory::try_new(&schema(), rows(1, 0..8, 20)).unwrap()).unwrap();
+    };
+    check_discarded(false, false, |_| {});
+    check_discarded(true, false, |_| {});
+    check_discarded(false, false, part);
+    check_discarded(true, false, part);
+    check_discarded(false, true, part);
+}
+
+#[test]
+fn a_run_with_episodes_is_not_given_up() {
+    let root = tempfile::tempdir().unwrap();
+    let dir = root.path().join("out");
+    let mut writer = DatasetWriter::create(&dir, spec(), WriteMode::New).unwrap();
+    write_recording(&mut writer, 0, 7).unwrap();
+    let before = tree(&dir);
+    assert!(!writer.discard().unwrap());
+    assert!(tree(&dir) == before);
+    // Nor is one that adds to a dataset.
+    DatasetWriter::create(&dir, spec(), WriteMode::Resume).unwrap().finish().unwrap();
+    let before = tree(&dir);
+    assert!(!DatasetWriter::create(&dir, spec(), WriteMode::Append).unwrap().discard().unwrap());
+    assert!(before.iter().all(|(name, bytes)| tree(&dir).get(name) == Some(bytes)));
+}
+
 #[test]
 fn attachments_are_kept_once_and_inside() {
     let dir = tempfile::tempdir().unwrap();

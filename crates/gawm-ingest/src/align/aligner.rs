@@ -305,10 +305,23 @@ impl<I: Clone> Aligner<I> {
                 }
             }
             match later {
-                None => return Some(at_ns),
+                None if self.has_begun(at_ns) => return Some(at_ns),
+                None => {
+                    at_ns = self
+                        .buffers
+                        .iter()
+                        .filter_map(|b| Some(b.time(b.first_after(at_ns)?).key_ns))
+                        .min()?
+                }
                 Some(ns) => at_ns = ns.max(at_ns.saturating_add(1)),
             }
         }
+    }
+
+    /// Whether there is anything at a time: where all streams may be masked, none of them says when rows begin.
+    fn has_begun(&self, at_ns: i64) -> bool {
+        self.rule.streams.iter().any(StreamRule::is_required)
+            || self.buffers.iter().any(|buffer| buffer.last_at(at_ns).is_some())
     }
 
     fn availability(&self, stream: usize, at_ns: i64) -> Availability {

@@ -113,6 +113,23 @@ fn rows_start_when_all_required_streams_are_there() {
     assert!(got.gaps.is_empty(), "{:?}", got.gaps);
 }
 
+/// Rows of streams that are all masked, and how they begin.
+fn check_all_masked(ticks: Ticks, samples: &[(usize, f64, f64)], expected: &[Vec<i64>]) {
+    let masked = StreamRule { gap: GapAction::Mask, ..stream(15) };
+    let rule = AlignRule { ticks, ..rule(vec![masked.clone(), masked], 100.0) };
+    assert_eq!(aligned(rule, samples).times_ms(), expected);
+}
+
+#[test]
+fn rows_of_masked_streams_begin_with_the_first_sample() {
+    let fixed = Ticks::Fixed { rate_hz: 100.0 };
+    let samples = [steps(0, 20.0, 50.0, 10.0), steps(1, 40.0, 60.0, 10.0)].concat();
+    check_all_masked(fixed.clone(), &samples, &[(20..=60).step_by(10).collect()]);
+    check_all_masked(fixed.clone(), &steps(1, 7.0, 27.0, 10.0), &[vec![7, 17, 27]]);
+    check_all_masked(fixed, &[], &[]);
+    check_all_masked(Ticks::Reference { stream: 1 }, &samples, &[vec![40, 50, 60]]);
+}
+
 #[test]
 fn a_gap_splits_and_never_squeezes_time() {
     let samples = [steps(0, 0.0, 50.0, 10.0), steps(0, 203.0, 243.0, 10.0)].concat();

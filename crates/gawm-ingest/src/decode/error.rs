@@ -187,6 +187,18 @@ pub enum DecodeError {
         /// The names in this message (the first 64).
         present: Vec<String>,
     },
+    /// A message holds some of the structs that paths pick by name, and lacks others.
+    #[error(
+        "{path:?}: {found} of the {wanted} elements that the stream picks are in this message (those that come apart need streams of their own)"
+    )]
+    ElementsAbsent {
+        /// The first of the paths.
+        path: String,
+        /// Elements that are there.
+        found: u32,
+        /// Elements that are picked.
+        wanted: u32,
+    },
     /// Parallel arrays differ in length.
     #[error("{path:?}: the array has {values} elements, its names {names}")]
     LengthMismatch {
@@ -219,7 +231,7 @@ impl DecodeError {
             Self::FieldAbsent { .. } => "field_absent",
             Self::WrongType { .. } => "wrong_type",
             Self::IndexOutOfRange { .. } => "index_out_of_range",
-            Self::NameAbsent { .. } => "name_absent",
+            Self::NameAbsent { .. } | Self::ElementsAbsent { .. } => "name_absent",
             Self::LengthMismatch { .. } => "array_length_mismatch",
             Self::NotNumeric { .. } => "not_numeric",
             Self::Compile(_) => "schema_not_decodable",

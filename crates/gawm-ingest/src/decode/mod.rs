@@ -51,6 +51,7 @@ pub use image::{
 };
 pub use path::{FieldPath, PathError, Segment};
 pub use plan::{Column, DecodePlan, StampSource};
+pub(crate) use resolve::closest_first;
 pub use row::{Decoded, RowSink, Scalar, Value};
 pub use schema::ros_library::SchemaFolderError;
 pub use stamp::{StampClass, StampUnit, classify_stamp};

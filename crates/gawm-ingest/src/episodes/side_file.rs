@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use gawm_dataset::csv;
+
 use super::LabelError;
 
 /// Largest side file that is read.
@@ -78,52 +80,24 @@ fn from_json(text: &str, key_column: Option<&str>) -> Result<SideFile, String> {
 }
 
 fn from_csv(text: &str) -> Result<SideFile, String> {
-    let mut records = csv_records(text)?.into_iter();
-    let header = records.next().ok_or("expected a header line, got an empty file")?;
+    let at = |(line, detail): (u64, String)| format!("line {line}: {detail}");
+    let mut records = csv::parse(text).map_err(at)?.into_iter();
+    let (line, header) = records.next().ok_or("expected a header line, got an empty file")?;
+    let names: Vec<String> = header.iter().map(|name| name.trim().to_owned()).collect();
+    if let Some(name) =
+        names.iter().enumerate().find_map(|(i, name)| names[..i].contains(name).then_some(name))
+    {
+        return Err(at((line, format!("expected columns of different names, got {name:?} twice"))));
+    }
     let mut rows = Vec::new();
-    for (index, record) in records.enumerate() {
-        if record.len() != header.len() {
-            let line = index + 2;
-            return Err(format!(
-                "record {line}: expected {} fields as in the header, got {}",
-                header.len(),
-                record.len()
-            ));
+    for (line, cells) in records {
+        if cells.len() != names.len() {
+            let detail = format!("expected {} cells as in the header, got {}", names.len(), cells.len());
+            return Err(at((line, detail)));
         }
-        rows.push(header.iter().cloned().zip(record).collect());
+        rows.push(names.iter().cloned().zip(cells).collect());
     }
     Ok(SideFile { rows })
-}
-
-/// Splits CSV as RFC 4180 has it; empty lines are skipped.
-fn csv_records(text: &str) -> Result<Vec<Vec<String>>, String> {
-    let text = text.strip_prefix('\u{feff}').unwrap_or(text);
-    let (mut records, mut record, mut field) = (Vec::new(), Vec::new(), String::new());
-    let mut is_quoted = false;
-    let mut chars = text.chars().peekable();
-    while let Some(char) = chars.next() {
-        match char {
-            '"' if is_quoted && chars.next_if_eq(&'"').is_some() => field.push('"'),
-            '"' if is_quoted => is_quoted = false,
-            '"' if field.is_empty() => is_quoted = true,
-            ',' if !is_quoted => record.push(std::mem::take(&mut field)),
-            '\r' if !is_quoted && chars.peek() == Some(&'\n') => {}
-            '\n' if !is_quoted => {
-                record.push(std::mem::take(&mut field));
-                records.push(std::mem::take(&mut record));
-            }
-            other => field.push(other),
-        }
-    }
-    if is_quoted {
-        return Err("a quoted field does not end".to_owned());
-    }
-    if !field.is_empty() || !record.is_empty() {
-        record.push(field);
-        records.push(record);
-    }
-    records.retain(|record| record.len() > 1 || record.first().is_some_and(|field| !field.is_empty()));
-    Ok(records)
 }
 
 #[cfg(test)]
@@ -137,8 +111,18 @@ mod tests {
         assert_eq!(file.find(Path::new("d/a.mcap"), Some("log"), None).unwrap()["task"], "stack, \"two\"");
         assert_eq!(file.find(Path::new("d/b.mcap"), Some("log"), None).unwrap()["task"], "x");
         assert!(file.find(Path::new("d/c.mcap"), Some("log"), None).is_none());
-        assert!(from_csv("a,b\n1\n").is_err());
-        assert!(from_csv("a,\"b\n").is_err());
+        let spreadsheet = from_csv("\u{feff}log; task\r\na.mcap;x, y\r\n").unwrap();
+        assert_eq!(spreadsheet.rows[0]["task"], "x, y");
+    }
+
+    #[test]
+    fn broken_csv_names_its_line() {
+        let error = |text: &str| from_csv(text).unwrap_err();
+        assert_eq!(error("a,b\n\n1\n"), "line 3: expected 2 cells as in the header, got 1");
+        assert!(error("a,b\n1,\"b\n").starts_with("line 2: "));
+        assert!(error("a,b\n1,2\n3,x\"y\"\n").starts_with("line 3: "));
+        assert!(error("a,b,a\n").contains("\"a\" twice"));
+        assert!(error("\n").contains("empty file"));
     }
 
     #[test]

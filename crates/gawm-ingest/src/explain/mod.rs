@@ -13,7 +13,7 @@ use thiserror::Error;
 
 use crate::align::Derivation;
 use crate::contract::{CheckedContract, ContractError, StreamData, TopicPattern, check, parse};
-use crate::decode::SchemaLibrary;
+use crate::decode::{SchemaLibrary, closest_first};
 use crate::run::{BindError, Binding, BoundStream, OpenRecording, RunError, split_by_publisher};
 use dataset::RowOrigin;
 
@@ -48,12 +48,20 @@ pub enum ExplainError {
         length: u64,
     },
     /// There is no such dimension.
-    #[error("no dimension {dim:?}: the dataset has {}", known.join(", "))]
+    #[error("no dimension {dim:?}: the dataset has {}", shown(.known))]
     Dim {
         /// The name asked for.
         dim: String,
-        /// Those that are there.
+        /// Those that are there, the most alike first.
         known: Vec<String>,
+    },
+    /// Several features have a dimension of this name.
+    #[error("dimension {dim:?} is in several features: expected one of {}", choices.join(", "))]
+    Ambiguous {
+        /// The name asked for.
+        dim: String,
+        /// The full names.
+        choices: Vec<String>,
     },
     /// The contract in the dataset cannot be read.
     #[error(transparent)]
@@ -75,9 +83,22 @@ impl ExplainError {
     /// Returns the exit code: 2 when the question is wrong, else 1.
     pub fn exit_code(&self) -> u8 {
         match self {
-            ExplainError::Episode { .. } | ExplainError::Frame { .. } | ExplainError::Dim { .. } => 2,
+            ExplainError::Episode { .. }
+            | ExplainError::Frame { .. }
+            | ExplainError::Dim { .. }
+            | ExplainError::Ambiguous { .. } => 2,
             _ => 1,
         }
+    }
+}
+
+/// Names that an error lists.
+const LISTED: usize = 40;
+
+fn shown(names: &[String]) -> String {
+    match names.len().checked_sub(LISTED) {
+        None | Some(0) => names.join(", "),
+        Some(more) => format!("{} and {more} more", names[..LISTED].join(", ")),
     }
 }
 
@@ -346,10 +367,18 @@ fn target<'a>(features: &'a [Feature], name: &str) -> Result<Target<'a>, Explain
             known.push(full);
         }
     }
-    if by_name.len() == 1 {
-        return by_name.pop().ok_or(ExplainError::Dim { dim: name.to_owned(), known });
+    match (by_name.pop(), by_name.is_empty()) {
+        (Some(only), true) => Ok(only),
+        (Some(last), false) => {
+            let features =
+                by_name.iter().chain([&last]).map(|target| format!("{}.{name}", target.feature.name));
+            Err(ExplainError::Ambiguous { dim: name.to_owned(), choices: features.collect() })
+        }
+        (None, _) => {
+            closest_first(&mut known, name);
+            Err(ExplainError::Dim { dim: name.to_owned(), known })
+        }
     }
-    Err(ExplainError::Dim { dim: name.to_owned(), known })
 }
 
 /// Returns the stream that values of a feature come from, and which of its values they are.

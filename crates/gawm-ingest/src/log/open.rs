@@ -56,7 +56,8 @@ impl Log {
             (None, Some(tail)) => walk.region(MAGIC.len() as u64, tail.footer_at),
             (None, None) => walk.region(MAGIC.len() as u64, source.len()),
         }
-        if tail.is_none() {
+        // A log that ends before the file does, though the file ends like one, has another behind it.
+        if tail.is_none() || walk.found.footer_end.is_some() {
             check_end(&source, walk.found.footer_end, &walk.found.damage, &mut damage);
         }
         let mut found = walk.found;
@@ -259,13 +260,15 @@ fn walk_uncovered(walk: &mut Walk<'_>, summary: &Summary) -> io::Result<()> {
     Ok(())
 }
 
-/// Reports how a file without a footer in its place ends.
+/// Reports how a file ends whose footer is not in its place.
 fn check_end(source: &Source, footer_end: Option<u64>, found: &[Damage], damage: &mut Vec<Damage>) {
     let length = source.len();
     match footer_end {
         Some(end) if end.saturating_add(MAGIC.len() as u64) < length => {
             let n_after = length - end - MAGIC.len() as u64;
-            let detail = format!("{n_after} bytes follow the end of the log; they are not read");
+            let detail = format!(
+                "{n_after} bytes follow the end of the log; they are not read (logs that were joined into one file are to be taken apart)"
+            );
             damage.push(Damage::new(DamageKind::TrailingBytes, end + MAGIC.len() as u64, detail));
         }
         Some(end) => {

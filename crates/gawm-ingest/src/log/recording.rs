@@ -30,6 +30,23 @@ pub struct Discovery {
     pub refused: Vec<OpenLogError>,
 }
 
+/// The files that were found so far, whatever names they were found by.
+#[derive(Default)]
+struct Seen {
+    paths: BTreeSet<PathBuf>,
+    /// How often a file was found again.
+    n_again: usize,
+}
+
+impl Seen {
+    /// Notes a file and returns whether it was not found before.
+    fn is_new(&mut self, path: &Path) -> bool {
+        let is_new = self.paths.insert(canonical(path));
+        self.n_again += usize::from(!is_new);
+        is_new
+    }
+}
+
 /// Finds the recordings at the named files and folders.
 ///
 /// A folder with a rosbag2 `metadata.yaml`, and a LeRobot folder, is one recording. In other folders, files named `x_0.mcap`, `x_1.mcap`, … without
@@ -41,7 +58,7 @@ pub fn discover(inputs: &[PathBuf]) -> Discovery {
     let mut discovery = Discovery::default();
     let named: BTreeSet<PathBuf> =
         inputs.iter().filter(|path| !path.is_dir()).map(|path| canonical(path)).collect();
-    let mut seen = BTreeSet::new();
+    let mut seen = Seen::default();
     for input in inputs {
         let is_metadata = input.file_name().is_some_and(|name| name == METADATA_FILE) && input.is_file();
         let input = &if is_metadata {
@@ -50,9 +67,9 @@ pub fn discover(inputs: &[PathBuf]) -> Discovery {
             input.clone()
         };
         if input.is_dir() {
-            let n_before = discovery.recordings.len() + discovery.refused.len();
+            let n_before = discovery.recordings.len() + discovery.refused.len() + seen.n_again;
             folder(input, MAX_DEPTH, &mut seen, &mut discovery);
-            if discovery.recordings.len() + discovery.refused.len() == n_before {
+            if discovery.recordings.len() + discovery.refused.len() + seen.n_again == n_before {
                 discovery.refused.push(OpenLogError::EmptyFolder { path: input.clone() });
             }
         } else {
@@ -81,17 +98,17 @@ fn push(
     parts: Vec<PathBuf>,
     name: String,
     rosbag2: Option<Rosbag2Metadata>,
-    seen: &mut BTreeSet<PathBuf>,
+    seen: &mut Seen,
     to: &mut Discovery,
 ) {
-    let parts: Vec<PathBuf> = parts.into_iter().filter(|part| seen.insert(canonical(part))).collect();
+    let parts: Vec<PathBuf> = parts.into_iter().filter(|part| seen.is_new(part)).collect();
     if !parts.is_empty() {
         to.recordings.push(Recording { name, parts, rosbag2 });
     }
 }
 
 /// Takes a file that was named.
-fn file(path: &Path, named: &BTreeSet<PathBuf>, seen: &mut BTreeSet<PathBuf>, to: &mut Discovery) {
+fn file(path: &Path, named: &BTreeSet<PathBuf>, seen: &mut Seen, to: &mut Discovery) {
     let folder = &path.parent().map_or_else(|| ".".into(), folder_or_here);
     // Metadata beside a named file only adds to it; when it is damaged, the file is still a file.
     let metadata = Rosbag2Metadata::read(folder).ok().flatten();
@@ -106,7 +123,7 @@ fn file(path: &Path, named: &BTreeSet<PathBuf>, seen: &mut BTreeSet<PathBuf>, to
 }
 
 /// Takes a folder that was named, or one below it.
-fn folder(path: &Path, depth: usize, seen: &mut BTreeSet<PathBuf>, to: &mut Discovery) {
+fn folder(path: &Path, depth: usize, seen: &mut Seen, to: &mut Discovery) {
     if crate::lerobot::is_dataset(path) {
         return push(vec![path.to_owned()], name_of(path), None, seen, to);
     }
@@ -127,7 +144,7 @@ fn folder(path: &Path, depth: usize, seen: &mut BTreeSet<PathBuf>, to: &mut Disc
     }
     for other in files {
         if let Some(found) = foreign_by_name(&other)
-            && seen.insert(canonical(&other))
+            && seen.is_new(&other)
         {
             to.refused.push(OpenLogError::NotMcap { path: other, found });
         }
@@ -137,7 +154,7 @@ fn folder(path: &Path, depth: usize, seen: &mut BTreeSet<PathBuf>, to: &mut Disc
     }
 }
 
-fn bag(path: &Path, metadata: Rosbag2Metadata, seen: &mut BTreeSet<PathBuf>, to: &mut Discovery) {
+fn bag(path: &Path, metadata: Rosbag2Metadata, seen: &mut Seen, to: &mut Discovery) {
     match metadata.parts(path) {
         Ok(parts) => match parts.iter().find_map(|part| Some((part, foreign_by_name(part)?))) {
             Some((part, found)) => to.refused.push(OpenLogError::NotMcap { path: part.clone(), found }),

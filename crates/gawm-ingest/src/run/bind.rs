@@ -335,18 +335,18 @@ fn dim_name(rule: &VectorRule, fields: &[FieldPath], column: usize, path: &str) 
     tail.reverse();
     let tail = tail.join("_").replace("_#", "_").replace('#', "");
     match picked {
-        Some(picked) if tail.is_empty() || tail == "position" => {
-            format!("{picked}{}", member_suffix(segments))
-        }
+        Some(picked) if tail.is_empty() => format!("{picked}{}", array_suffix(segments)),
+        Some(picked) if tail == "position" => picked,
         Some(picked) => format!("{picked}.{tail}"),
         None => tail,
     }
 }
 
-/// Tells velocities and efforts of a joint from its position.
-fn member_suffix(segments: &[Segment]) -> String {
-    match segments.first() {
-        Some(Segment::Field(first)) if first != "position" && first != "positions" => format!(".{first}"),
+/// Tells velocities and efforts of a joint from its position, by the array that it is picked from.
+fn array_suffix(segments: &[Segment]) -> String {
+    let picked = segments.iter().rposition(|segment| matches!(segment, Segment::Key { .. }));
+    match picked.and_then(|at| segments[..at].last()) {
+        Some(Segment::Field(array)) if array != "position" && array != "positions" => format!(".{array}"),
         _ => String::new(),
     }
 }

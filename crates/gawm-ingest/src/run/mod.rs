@@ -29,7 +29,7 @@ pub(crate) mod made_logs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use gawm_dataset::{DatasetSpec, DatasetSummary, DatasetWriter, WriteError, WriteMode};
+use gawm_dataset::{DatasetSpec, DatasetSummary, DatasetWriter, WriteMode};
 use gawm_schema::Schema;
 
 pub use bind::{BindError, Binding, BoundFeature, BoundStream, FeatureSource};
@@ -107,29 +107,14 @@ pub fn run(options: &RunOptions<'_>, report: &mut Report) -> Result<RunOutcome, 
         report.files.push(FileReport::refused(error.path(), with_hint(&error.to_string(), error.hint())));
     }
     report.warnings.extend(options.contract.warnings.iter().cloned());
-    let mut run = Run {
-        options,
-        library,
-        labels,
-        pool,
-        writer: None,
-        ages: Vec::new(),
-        is_new_folder: is_empty(options.out),
-    };
-    for (index, recording) in recordings.iter().enumerate() {
-        if let Some((shard, n)) = options.shard
-            && index as u64 % n != shard
-        {
-            continue;
+    let mut run = Run { options, library, labels, pool, writer: None, ages: Vec::new() };
+    match run.recordings(&recordings, report) {
+        Ok(()) => run.finish(report),
+        Err(error) => {
+            run.give_up(&error, report);
+            Err(error)
         }
-        let file = run.recording(recording, report)?;
-        report.files.push(file);
     }
-    run.finish(report)
-}
-
-fn is_empty(folder: &Path) -> bool {
-    std::fs::read_dir(folder).map_or(true, |mut entries| entries.next().is_none())
 }
 
 fn library(options: &RunOptions<'_>) -> Result<SchemaLibrary, RunError> {
@@ -158,10 +143,33 @@ struct Run<'a> {
     pool: rayon::ThreadPool,
     writer: Option<DatasetWriter>,
     ages: Vec<AgeCounts>,
-    is_new_folder: bool,
 }
 
 impl Run<'_> {
+    fn recordings(&mut self, recordings: &[Recording], report: &mut Report) -> Result<(), RunError> {
+        for (index, recording) in recordings.iter().enumerate() {
+            if let Some((shard, n)) = self.options.shard
+                && index as u64 % n != shard
+            {
+                continue;
+            }
+            let file = self.recording(recording, report)?;
+            report.files.push(file);
+        }
+        Ok(())
+    }
+
+    /// Leaves nothing of a run that failed before its first recording was done, so that the corrected one can begin;
+    /// what was interrupted or has recordings stays to be resumed.
+    fn give_up(self, error: &RunError, report: &mut Report) {
+        if matches!(error, RunError::Interrupted) {
+            return;
+        }
+        if let Some(Err(error)) = self.writer.map(DatasetWriter::discard) {
+            report.warnings.push(format!("cannot remove what was written: {error}"));
+        }
+    }
+
     fn recording(&mut self, recording: &Recording, report: &mut Report) -> Result<FileReport, RunError> {
         if self.options.interrupt.load(Ordering::Relaxed) {
             return Err(RunError::Interrupted);
@@ -281,17 +289,12 @@ impl Run<'_> {
         let Some(writer) = self.writer else { return Err(nothing(report)) };
         let schema = writer.schema().clone();
         let already = report.files.iter().any(|file| file.status == FileStatus::AlreadyThere);
-        if report.episodes == 0 && !already && self.is_new_folder {
-            drop(writer);
-            // The folder was absent or empty before this run, and nothing came of it.
-            std::fs::remove_dir_all(self.options.out).map_err(|source| RunError::Write {
-                dir: self.options.out.to_owned(),
-                source: WriteError::Io { action: "remove", path: self.options.out.to_owned(), source },
-            })?;
+        let to_dir = |source| RunError::Write { dir: self.options.out.to_owned(), source };
+        if report.episodes == 0 && !already && !writer.has_episodes() {
+            writer.discard().map_err(to_dir)?;
             return Err(nothing(report));
         }
-        let summary =
-            writer.finish().map_err(|source| RunError::Write { dir: self.options.out.to_owned(), source })?;
+        let summary = writer.finish().map_err(to_dir)?;
         report.streams = schema
             .streams
             .iter()

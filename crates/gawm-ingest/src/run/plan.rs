@@ -171,9 +171,18 @@ impl GroupDecoder {
                 let part = part.map(|part| part as u32);
                 rows.push(Row { group: group as u32, part, values: start..values.len(), stamp_ns });
             }
-            Ok(matches!(outcome, Decoded::Row { .. }))
+            match outcome {
+                Decoded::Row { .. } => Ok(true),
+                Decoded::NotInMessage { found: 0, .. } => Ok(false),
+                Decoded::NotInMessage { found, missing } => Err(DecodeError::ElementsAbsent {
+                    path: decoder.columns().into_iter().next().unwrap_or_default(),
+                    found,
+                    wanted: found + missing,
+                }),
+            }
         };
         let has_all = match take(&self.whole, &mut sinks.whole, None) {
+            Err(DecodeError::ElementsAbsent { .. }) if !self.parts.is_empty() => false,
             Err(error) if self.parts.is_empty() && is_of_others(&error, &self.names[0]) => return Ok(()),
             Err(error @ DecodeError::NameAbsent { .. }) if self.parts.is_empty() => return Err(error),
             Err(DecodeError::NameAbsent { .. }) => false,

@@ -24,6 +24,9 @@ const RESET_MESSAGES: usize = 3;
 /// Image bytes that may wait for the disorder window to pass.
 const MAX_IMAGE_BYTES: usize = 192 << 20;
 
+/// A stream that begins this much later than the first is worth a warning.
+const LATE_STREAM_NS: i64 = 1_000_000_000;
+
 /// Everything that is fixed for a recording.
 pub(crate) struct SessionRules<'a> {
     pub(crate) contract: &'a CheckedContract,
@@ -65,6 +68,8 @@ pub(crate) struct Session<'a, 's> {
     scratch: Vec<f64>,
     /// Usable samples per stream over all segments.
     pub(crate) samples: Vec<u64>,
+    /// The earliest sample of each stream, as rows count time.
+    first_ns: Vec<Option<i64>>,
 }
 
 /// What is remembered of a topic.
@@ -138,6 +143,7 @@ impl<'a, 's> Session<'a, 's> {
             non_finite: BTreeMap::new(),
             scratch: Vec::new(),
             samples: vec![0; rules.rule.streams.len()],
+            first_ns: vec![None; rules.rule.streams.len()],
         };
         session.open_segment();
         session
@@ -256,6 +262,7 @@ impl<'a, 's> Session<'a, 's> {
             );
             self.warn(text);
         }
+        self.warn_of_late_streams();
         if self.unclosed > 0 {
             let text = format!(
                 "{} episodes have no end mark; closed at the next start or at the end of the log",
@@ -269,6 +276,27 @@ impl<'a, 's> Session<'a, 's> {
             self.warn(text);
         }
         Ok(())
+    }
+
+    /// Says which streams keep rows from beginning when the others do.
+    fn warn_of_late_streams(&mut self) {
+        let is_whole = matches!(self.rules.contract.episodes, EpisodeRule::File | EpisodeRule::Gap { .. });
+        let Some(earliest) = self.first_ns.iter().flatten().min().copied() else { return };
+        if !is_whole || self.rules.is_listed || self.segments > 0 {
+            return;
+        }
+        for stream in 0..self.first_ns.len() {
+            let late_ns = self.first_ns[stream].map_or(0, |first| first.saturating_sub(earliest));
+            if late_ns > LATE_STREAM_NS && self.rules.rule.streams[stream].is_required() {
+                let name = &self.rules.binding.streams[stream].name;
+                let topic = &self.rules.binding.streams[stream].topic;
+                let text = format!(
+                    "stream {name:?} ({topic}) begins {:.3} s after the first sample of the log: there is no row before (of numbers, gap = \"mask\" does not wait)",
+                    late_ns as f64 / 1e9
+                );
+                self.warn(text);
+            }
+        }
     }
 
     fn close_segment(&mut self) -> Result<(), Stop> {
@@ -425,6 +453,7 @@ impl<'a, 's> Session<'a, 's> {
                 *self.non_finite.entry((stream, defect)).or_default() += 1;
             }
             let time = self.times(stream, message, stamp_ns);
+            note_first(&mut self.first_ns[stream], time.key_ns);
             if let Err(error) = self.aligner.push_values(stream, time, &converted) {
                 late = Some(error);
             }
@@ -463,6 +492,7 @@ impl<'a, 's> Session<'a, 's> {
                 return;
             }
             let time = self.times(stream, message, stamp_ns);
+            note_first(&mut self.first_ns[stream], time.key_ns);
             if let Err(late) = self.aligner.push_image(stream, time, picture.clone()) {
                 self.count_late(name, message, late);
                 return;
@@ -513,6 +543,10 @@ fn defect_of(values: &mut [f64], kind: Kind, (is_encoded, is_float32): (bool, bo
         values.fill(f64::NAN);
     }
     Some(defect)
+}
+
+fn note_first(first: &mut Option<i64>, ns: i64) {
+    *first = Some(first.map_or(ns, |earlier| earlier.min(ns)));
 }
 
 fn has_rotation(kind: Kind, element: &[f64]) -> bool {

@@ -226,3 +226,57 @@ fn a_suggestion_takes_frames_that_move_where_nothing_else_says_how_the_robot_sta
     assert_eq!(rows[10], [0.1, 0.5, 0.0, 0.0, 0.0, 0.0, 1.0]);
     assert!(text.contains("\"base.qw\""), "{text}");
 }
+
+#[test]
+fn a_run_that_failed_is_not_in_the_way_of_the_corrected_one() {
+    let mut sent = two_publishers(&[]);
+    sent.retain(|(_, ms, _)| !(1000..1500).contains(ms));
+    let made = made(&sent);
+    let streams: [&[&str]; 1] = [&["a", "b"]];
+    for has_folder in [false, true] {
+        if has_folder {
+            std::fs::create_dir(&made.out).unwrap();
+        }
+        let (outcome, _) = run_of(&contract_of(&streams, "gap = \"fail\""), &made.log, &made.out);
+        assert!(matches!(outcome, Err(RunError::Gap { .. })), "{outcome:?}");
+        assert_eq!(made.out.exists(), has_folder);
+    }
+    let (outcome, _) = run_of(&contract_of(&streams, ""), &made.log, &made.out);
+    assert_eq!(outcome.unwrap().report.episodes, 2);
+}
+
+/// A trot: the legs move alike, half a period apart, and the commands name them in another order.
+#[test]
+fn commands_are_matched_to_joints_by_name() {
+    let angle = |joint: f64, ms: f64| 0.4 * (std::f64::consts::PI * (ms / 400.0 + joint)).sin();
+    let mut sent: Vec<Sent> = Vec::new();
+    for i in 0..600_u64 {
+        let ms = 10 * i;
+        let values = |late_ms: f64| [0.0, 1.0, 0.5].map(|joint| angle(joint, ms as f64 - late_ms));
+        let [a, b, c] = values(40.0);
+        sent.push(("/joints", ms, format!(r#"{{"name":["a","b","c"],"position":[{a},{b},{c}]}}"#)));
+        if i % 2 == 0 {
+            let [a, b, c] = values(0.0);
+            let text = format!(r#"{{"joint_names":["c","b","a"],"points":[{{"positions":[{c},{b},{a}]}}]}}"#);
+            sent.push(("/legs/command", ms + 1, text));
+        }
+    }
+    let made = made(&sent);
+    let suggestion =
+        suggest(std::slice::from_ref(&made.log), &SchemaLibrary::builtin(), &OpenOptions::default()).unwrap();
+    let action = suggestion.contract.stream.iter().find(|stream| stream.feature == "action").unwrap();
+    let named = |joint: &str| format!("points[0].positions[joint_names=\"{joint}\"]");
+    assert_eq!(action.fields, ["c", "b", "a"].map(named), "{}", to_toml(&suggestion));
+    assert!((38.0..40.0).contains(&action.offset_ms), "{}", to_toml(&suggestion));
+}
+
+#[test]
+fn a_stream_that_keeps_rows_from_beginning_is_named() {
+    let mut sent = two_publishers(&[]);
+    sent.retain(|(_, ms, text)| *ms >= 1500 || !text.contains("jaw"));
+    let made = made(&sent);
+    let streams: [&[&str]; 2] = [&["a", "b"], &["jaw"]];
+    let outcome = run_of(&contract_of(&streams, ""), &made.log, &made.out).0.unwrap();
+    let said = outcome.report.warnings.join("\n");
+    assert!(said.contains("\"s1\" (/joints) begins 1.503 s after"), "{said}");
+}

@@ -193,7 +193,9 @@ fn labels(suggestion: &mut Suggestion, survey: &Survey) {
             let key = wanted.iter().find(|key| values.contains_key(**key))?;
             Some(LabelSource::Metadata(MetadataLabel { metadata: name.clone(), key: (*key).to_owned() }))
         });
-        let source = source.or_else(|| topic_label(label, suggestion, survey));
+        let source = source
+            .or_else(|| topic_label(label, suggestion, survey))
+            .or_else(|| marker_label(wanted, suggestion, survey));
         if let Some(source) = source {
             reasons.push(format!("{label}: found {}", shown(&source)));
             let slot = &mut suggestion.contract.labels;
@@ -214,6 +216,22 @@ fn labels(suggestion: &mut Suggestion, survey: &Survey) {
         );
     }
     suggestion.reasons.insert("labels", reasons);
+}
+
+/// A text beside what marks the episodes.
+fn marker_label(wanted: &[&str], suggestion: &Suggestion, survey: &Survey) -> Option<LabelSource> {
+    let marker = suggestion.contract.episodes.topic.as_ref()?;
+    let field = suggestion.contract.episodes.field.as_ref()?;
+    let messages = messages(survey.topics.get(marker)?, &SchemaLibrary::builtin());
+    let beside = |key: &str| match field.rsplit_once('.') {
+        Some((parent, _)) => format!("{parent}.{key}"),
+        None => key.to_owned(),
+    };
+    let is_text = |path: &String| {
+        messages.iter().any(|m| crate::episodes::value_at(m, path).is_some_and(|value| value.is_string()))
+    };
+    let field = wanted.iter().map(|key| beside(key)).find(is_text)?;
+    Some(LabelSource::Topic(TopicLabel { topic: marker.clone(), field }))
 }
 
 fn shown(source: &LabelSource) -> String {

@@ -20,6 +20,8 @@ enum JointLayout<'a> {
     Parallel { key: &'static str, value: &'static str },
     /// An array of structs with `name` and `position`.
     Structs { list: &'a str },
+    /// An array, and in the only struct of another the values, as in a trajectory of one point.
+    Point { key: &'static str, list: &'static str, value: &'static str },
 }
 
 fn joint_layout(topic: &Topic) -> Option<JointLayout<'_>> {
@@ -30,6 +32,9 @@ fn joint_layout(topic: &Topic) -> Option<JointLayout<'_>> {
         parallel.into_iter().find(|(key, value)| has(&format!("{key}[]")) && has(&format!("{value}[]")))
     {
         return Some(JointLayout::Parallel { key, value });
+    }
+    if has("joint_names[]") && has("points[].positions[]") {
+        return Some(JointLayout::Point { key: "joint_names", list: "points", value: "positions" });
     }
     topic.fields.iter().find_map(|field| {
         let list = field.path.strip_suffix("[].name")?;
@@ -48,6 +53,12 @@ pub(crate) fn joints(topic: &Topic, messages: &[Value], survey: &Survey) -> Opti
             JointLayout::Parallel { key, value } => {
                 let names = message.get(key)?.as_array()?;
                 let values = message.get(value)?.as_array()?;
+                if names.len() == values.len() { texts(names) } else { return None }
+            }
+            JointLayout::Point { key, list, value } => {
+                let names = message.get(key)?.as_array()?;
+                let [point] = message.get(list)?.as_array()?.as_slice() else { return None };
+                let values = point.get(value)?.as_array()?;
                 if names.len() == values.len() { texts(names) } else { return None }
             }
             JointLayout::Structs { list } => message
@@ -142,6 +153,7 @@ fn joints_of(all: &[Vec<String>], layout: JointLayout<'_>, survey: &Survey) -> O
         let field = match layout {
             JointLayout::Parallel { key, value } => format!("{value}[{key}=\"{quoted}\"]"),
             JointLayout::Structs { list } => format!("{list}[name=\"{quoted}\"].position"),
+            JointLayout::Point { key, list, value } => format!("{list}[0].{value}[{key}=\"{quoted}\"]"),
         };
         let is_same = groups.last().is_some_and(|group| {
             group.kind == kind && group.reason == reason && group.limits.is_empty() == limits.is_none()
@@ -152,15 +164,9 @@ fn joints_of(all: &[Vec<String>], layout: JointLayout<'_>, survey: &Survey) -> O
                 group.limits.extend(limits);
             }
             None => groups.push(Group {
-                fields: vec![field],
-                kind,
-                unit: Some(unit.to_owned()),
                 limits: limits.into_iter().collect(),
-                reason: reason.to_owned(),
                 is_joints: true,
-                share: 1.0,
-                names: Vec::new(),
-                is_stamped: false,
+                ..Group::new(vec![field], kind, Some(unit.to_owned()), reason.to_owned())
             }),
         }
     }
@@ -186,17 +192,8 @@ pub(crate) fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
             if !has_direction(&paths, messages) {
                 continue;
             }
-            groups.push(Group {
-                fields: paths,
-                kind: KindSpec::Quaternion,
-                unit: None,
-                limits: Vec::new(),
-                reason: format!("four numbers named x, y, z, w: a quaternion in {order} order"),
-                is_joints: false,
-                share: 1.0,
-                names: Vec::new(),
-                is_stamped: false,
-            });
+            let reason = format!("four numbers named x, y, z, w: a quaternion in {order} order");
+            groups.push(Group::new(paths, KindSpec::Quaternion, None, reason));
             width += 4;
             continue;
         }
@@ -216,17 +213,7 @@ pub(crate) fn numbers(topic: &Topic, messages: &[Value]) -> Vec<Group> {
             .filter(|group| group.kind == kind && group.unit == unit && group.reason == reason)
         {
             Some(group) => group.fields.push(path),
-            None => groups.push(Group {
-                fields: vec![path],
-                kind,
-                unit,
-                limits: Vec::new(),
-                reason,
-                is_joints: false,
-                share: 1.0,
-                names: Vec::new(),
-                is_stamped: false,
-            }),
+            None => groups.push(Group::new(vec![path], kind, unit, reason)),
         }
     }
     for group in
@@ -342,29 +329,15 @@ fn fixed_path(field: &FieldInfo, messages: &[Value]) -> Option<(String, usize)> 
         }
         [_] if field.path.ends_with("[]") => {
             let base = field.path.trim_end_matches("[]");
-            let lengths: Vec<Option<usize>> = messages
-                .iter()
-                .map(|message| {
-                    let items = crate::episodes::value_at(message, base)?;
-                    let items = items.as_array()?;
-                    items.iter().all(|item| is_number(Some(item))).then_some(items.len())
-                })
-                .collect();
-            let n = lengths
-                .iter()
-                .flatten()
-                .max_by_key(|n| lengths.iter().filter(|other| **other == Some(**n)).count())?;
-            let same = lengths.iter().filter(|length| **length == Some(*n)).count();
+            let items = |message: &Value| crate::episodes::value_at(message, base)?.as_array().cloned();
+            let n = usual_length(messages, |message| {
+                let items = items(message)?;
+                items.iter().all(|item| is_number(Some(item))).then_some(items.len())
+            })?;
             // Ranges of a scanner are infinite where nothing is hit: no row of them could be used.
-            let finite = messages
-                .iter()
-                .filter_map(|message| crate::episodes::value_at(message, base))
-                .filter(|items| {
-                    items.as_array().is_some_and(|items| items.iter().all(|item| !item.is_string()))
-                })
-                .count();
-            (*n > 0 && *n <= MAX_WIDTH && is_most(same, lengths.len()) && is_most(finite, lengths.len()))
-                .then(|| (format!("{base}[0:{n}]"), *n))
+            let is_finite = |items: &Vec<Value>| items.iter().all(|item| !item.is_string());
+            let finite = messages.iter().filter_map(items).filter(is_finite).count();
+            is_most(finite, messages.len()).then(|| (format!("{base}[0:{n}]"), n))
         }
         _ => path_in_structs(field, messages),
     }
@@ -392,13 +365,8 @@ fn kind_of(topic: &Topic, field: &FieldInfo) -> (KindSpec, Option<String>, Strin
         return (KindSpec::Bool, None, "truth values".to_owned());
     }
     if names::is_gripper(&field.path) || names::is_gripper(&topic.channel.topic) {
-        let unit = if field.path.ends_with("_m") {
-            some("m")
-        } else if field.path.ends_with("_n") {
-            some("N")
-        } else {
-            None
-        };
+        let unit = if field.path.ends_with("_n") { Some("N") } else { names::unit_of(&field.path) };
+        let unit = unit.map(str::to_owned);
         if unit.as_deref() != Some("N") {
             return (KindSpec::Gripper, unit, "named as a gripper".to_owned());
         }
@@ -425,8 +393,7 @@ fn kind_of(topic: &Topic, field: &FieldInfo) -> (KindSpec, Option<String>, Strin
         () if field.path.ends_with("_deg") => {
             return (KindSpec::Angle, some("deg"), "an angle by its name".to_owned());
         }
-        () if field.path.ends_with("_m") => some("m"),
-        () => None,
+        () => names::unit_of(&field.path).map(str::to_owned),
     };
     let reason =
         if unit.is_some() { "unit by type and name" } else { "unit unknown: say `unit` if you know it" };
@@ -458,15 +425,5 @@ fn json_in_text(topic: &Topic, messages: &[Value]) -> Option<Group> {
     }
     let reason = "numbers of the JSON that the text holds".to_owned();
     let kind = if names::is_gripper(&topic.channel.topic) { KindSpec::Gripper } else { KindSpec::Linear };
-    Some(Group {
-        fields,
-        kind,
-        unit: None,
-        limits: Vec::new(),
-        reason,
-        is_joints: false,
-        share: 1.0,
-        names: Vec::new(),
-        is_stamped: false,
-    })
+    Some(Group::new(fields, kind, None, reason))
 }

@@ -51,6 +51,14 @@ pub(crate) struct Group {
     pub(crate) is_stamped: bool,
 }
 
+impl Group {
+    /// Returns a group of values that are no joints, from messages of one publisher.
+    pub(crate) fn new(fields: Vec<String>, kind: KindSpec, unit: Option<String>, reason: String) -> Group {
+        let (limits, names) = (Vec::new(), Vec::new());
+        Group { fields, kind, unit, limits, reason, is_joints: false, share: 1.0, names, is_stamped: false }
+    }
+}
+
 /// Guesses streams, clocks, tolerances and the rate.
 pub(crate) fn guess(survey: &Survey, library: &SchemaLibrary) -> Suggestion {
     let mut suggestion = Suggestion { contract: Contract::default(), ..Suggestion::default() };
@@ -272,6 +280,9 @@ fn add_groups(
         }
         stream.fields.clone_from(&group.fields);
         stream.names.clone_from(&group.names);
+        if group.names.is_empty() && matches!(group.fields.as_slice(), [field] if field == "data") {
+            stream.names = vec![names::words(&topic.channel.topic).join("_")];
+        }
         stream.kind = group.kind;
         stream.unit.clone_from(&group.unit);
         stream.limits.clone_from(&group.limits);
@@ -376,7 +387,12 @@ fn add_states(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Gu
             _ if is_marker(groups, topic) || names::is_reward(&topic.channel.topic) => {
                 if !names::is_recording(&topic.channel.topic) {
                     let feature = format!("annotation.{feature}");
+                    let n_before = suggestion.contract.stream.len();
                     add_groups(suggestion, topic, groups, &feature, RoleSpec::Annotation, why);
+                    // What is only carried along decides neither where rows begin nor where they end.
+                    for stream in &mut suggestion.contract.stream[n_before..] {
+                        stream.gap = GapRule::Mask;
+                    }
                 }
             }
             _ => add_groups(

@@ -88,23 +88,15 @@ fn on_grid(series: &Series, values: &[f64], start_ns: i64, n: usize) -> Vec<f64>
         .collect()
 }
 
-/// Central differences; zero at the ends.
+/// Central differences. The ends have none: zeros there would lie on each other at no delay, and speak for it.
 fn differences(values: &[f64]) -> Vec<f64> {
-    let mut out = vec![0.0; values.len()];
-    for k in DIFFERENCE..values.len().saturating_sub(DIFFERENCE) {
-        out[k] = values[k + DIFFERENCE] - values[k - DIFFERENCE];
-    }
-    out
+    values.windows(2 * DIFFERENCE + 1).map(|stretch| stretch[2 * DIFFERENCE] - stretch[0]).collect()
 }
 
 /// The mean over the stretch that a central difference spans.
 fn smoothed(values: &[f64]) -> Vec<f64> {
-    let mut out = vec![0.0; values.len()];
-    for k in DIFFERENCE..values.len().saturating_sub(DIFFERENCE) {
-        let stretch = &values[k - DIFFERENCE..=k + DIFFERENCE];
-        out[k] = stretch.iter().sum::<f64>() / stretch.len() as f64;
-    }
-    out
+    let mean = |stretch: &[f64]| stretch.iter().sum::<f64>() / stretch.len() as f64;
+    values.windows(2 * DIFFERENCE + 1).map(mean).collect()
 }
 
 fn best(command: &[f64], state: &[f64], is_velocity: bool) -> Option<Following> {
@@ -168,6 +160,12 @@ mod tests {
         let speed =
             |t: f64| 2.0 * (2.0 * t).cos() + 0.4 * 5.3 * (5.3 * t + 1.0).cos() - 1.1 * (11.0 * t).sin();
         check_following(&series(4.0, 2500, speed), &state, 0.04, true);
+    }
+
+    #[test]
+    fn slow_motion_has_a_delay_too() {
+        let slow = |t: f64| 0.8 * (t + 1.0).sin();
+        check_following(&series(40.0, 250, slow), &series(4.0, 2500, |t| slow(t - 0.02)), 0.02, false);
     }
 
     #[test]

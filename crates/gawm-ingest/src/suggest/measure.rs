@@ -12,13 +12,15 @@ use super::survey::Survey;
 use crate::contract::{
     ActionTimingSpec, AlignSpec, Clock, KindSpec, ReduceSpec, RoleSpec, StreamSpec, check,
 };
-use crate::decode::SchemaLibrary;
+use crate::decode::{FieldPath, SchemaLibrary, Segment};
 use crate::run::{BindError, Binding, Plans};
 
 /// Samples per stream that are looked at.
 const MAX_SAMPLES: usize = 40_000;
 /// A correlation below this says nothing.
 const MIN_CORRELATION: f64 = 0.7;
+/// Correlations that differ by less say the same.
+const EQUAL_CORRELATION: f64 = 0.005;
 /// Columns of an action that are compared with the state, at most.
 const MAX_COLUMNS: usize = 32;
 
@@ -136,9 +138,12 @@ pub(crate) fn wrap_of(values: &[f64]) -> Wrap {
 }
 
 fn time_actions(suggestion: &mut Suggestion, survey: &Survey, series: &StreamSeries) {
-    let states: Vec<usize> = (0..suggestion.contract.stream.len())
-        .filter(|&index| suggestion.contract.stream[index].role != Some(RoleSpec::Action))
-        .filter(|index| series.contains_key(index))
+    let streams = &suggestion.contract.stream;
+    let places: Vec<(Place, Option<String>)> = series
+        .iter()
+        .filter(|(index, _)| streams[**index].role != Some(RoleSpec::Action))
+        .flat_map(|(&index, columns)| (0..columns.len()).map(move |at| (index, at, columns.len())))
+        .map(|(index, at, n)| ((index, at), element_name(&streams[index], n, at)))
         .collect();
     let kinds: Vec<(KindSpec, Option<Wrap>, Option<String>)> = suggestion
         .contract
@@ -155,11 +160,20 @@ fn time_actions(suggestion: &mut Suggestion, survey: &Survey, series: &StreamSer
             continue;
         };
         let columns = series.get(&index).map_or(&[][..], Vec::as_slice);
-        let followed: Vec<Option<Follower>> = columns
-            .iter()
-            .enumerate()
-            .map(|(at, column)| (at < MAX_COLUMNS).then(|| best_state(column, &states, series)).flatten())
-            .collect();
+        let follower = |at: usize| {
+            let name = element_name(stream, columns.len(), at);
+            let own: Vec<Place> = places
+                .iter()
+                .filter(|(_, other)| name.is_some() && *other == name)
+                .map(|(place, _)| *place)
+                .collect();
+            // What has the name of the command is what it moves, whatever moves like it.
+            let among = if own.is_empty() { places.iter().map(|(place, _)| *place).collect() } else { own };
+            best_state(&columns[at], &among, series)
+        };
+        let is_measured = |at: usize| at < MAX_COLUMNS && stream.kind != KindSpec::Bool;
+        let followed: Vec<Option<Follower>> =
+            (0..columns.len()).map(|at| is_measured(at).then(|| follower(at)).flatten()).collect();
         let lags = followed.iter().flatten().map(|follower| follower.following.lag_s * 1e3);
         lags_of.entry(topic).or_default().extend(lags);
         followers.insert(index, followed);
@@ -211,19 +225,41 @@ fn is_position(stream: &StreamSpec, followed: &[Option<Follower>]) -> bool {
         && !is_velocity(stream, n_velocity, found.count())
 }
 
-/// Returns the state column that follows a command best.
-fn best_state(command: &Series, states: &[usize], series: &StreamSeries) -> Option<Follower> {
-    let mut best: Option<Follower> = None;
-    for &stream in states {
-        for (column, state) in series[&stream].iter().enumerate() {
-            if let Some(following) = following(command, state)
-                && best.is_none_or(|other| following.correlation > other.following.correlation)
-            {
-                best = Some(Follower { stream, column, following });
-            }
-        }
-    }
-    best.filter(|best| best.following.correlation >= MIN_CORRELATION)
+/// A state column: index of its stream, and its place there.
+type Place = (usize, usize);
+
+/// Returns the name that picks a column out of its message, as that of a joint does.
+fn element_name(stream: &StreamSpec, n_columns: usize, at: usize) -> Option<String> {
+    let field = stream.fields.get(at).filter(|_| stream.fields.len() == n_columns)?;
+    let path: FieldPath = field.parse().ok()?;
+    path.segments().iter().rev().find_map(|segment| match segment {
+        Segment::Key { value, .. } => Some(value.clone()),
+        _ => None,
+    })
+}
+
+/// Returns the state column that follows a command best; of those that do so equally well, as the legs of a gait do,
+/// the one that follows soonest.
+fn best_state(command: &Series, places: &[Place], series: &StreamSeries) -> Option<Follower> {
+    let found: Vec<Follower> = places
+        .iter()
+        .filter_map(|&(stream, column)| {
+            let following = following(command, series.get(&stream)?.get(column)?)?;
+            Some(Follower { stream, column, following })
+        })
+        .collect();
+    let highest = found.iter().map(|found| found.following.correlation).fold(f64::NEG_INFINITY, f64::max);
+    let equal = found.into_iter().filter(|found| found.following.correlation >= highest - EQUAL_CORRELATION);
+    equal
+        .min_by(|a, b| a.following.lag_s.total_cmp(&b.following.lag_s))
+        .filter(|best| best.following.correlation >= MIN_CORRELATION)
+}
+
+/// Returns the upper median; 0 of nothing.
+fn median(values: &[f64]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted.get(sorted.len() / 2).copied().unwrap_or(0.0)
 }
 
 /// Sets offset and timing.
@@ -240,11 +276,9 @@ fn apply(
     let is_velocity = is_velocity(stream, n_velocity, found.len());
     let is_told = 2 * found.len() >= n_columns.max(1);
     if is_told {
-        let mut lags = measured.lags_ms.to_vec();
-        lags.sort_by(f64::total_cmp);
         // A step acts over the period after its command, so what is measured is later by half a period.
         let half_ms = if is_delta && rate_hz > 0.0 { 500.0 / rate_hz } else { 0.0 };
-        let lag_ms = (lags.get(lags.len() / 2).copied().unwrap_or(0.0) - half_ms).max(0.0);
+        let lag_ms = (median(measured.lags_ms) - half_ms).max(0.0);
         let correlation = found.iter().map(|(_, f)| f.correlation).fold(f64::INFINITY, f64::min);
         let what = if is_delta {
             "step"
@@ -258,6 +292,10 @@ fn apply(
             "offset: the state follows this {what} command after {lag_ms:.1} ms (correlation of {} of {n_columns} columns at least {correlation:.2}), so it acts that much later",
             found.len()
         ));
+    } else if stream.kind == KindSpec::Bool && !measured.lags_ms.is_empty() {
+        let lag_ms = median(measured.lags_ms);
+        stream.offset_ms = if lag_ms >= 1.0 { (lag_ms * 10.0).round() / 10.0 } else { 0.0 };
+        reasons.push("offset: that of the other values of its message".to_owned());
     } else {
         reasons.push(
             "offset: no clear delay between this command and the state; 0 until you know better".to_owned(),

@@ -18,17 +18,21 @@ mod survey;
 mod transforms;
 mod urdf;
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use thiserror::Error;
 
-use crate::contract::Contract;
-use crate::decode::SchemaLibrary;
+use crate::contract::{Contract, LabelSource};
+use crate::decode::{FieldInfo, FieldPath, Scalar, SchemaLibrary, Segment};
 use crate::lerobot::{self, LerobotRecording};
 use crate::log::{OpenLogError, OpenOptions, discover};
 use crate::tabular;
 
 pub use survey::DecodingProbe;
+
+/// Other fields of a mapped topic that are named.
+const MAX_OTHERS: usize = 12;
 
 /// Why no contract can be suggested.
 #[derive(Debug, Error)]
@@ -74,7 +78,7 @@ pub struct Suggestion {
     /// Reasons for each stream.
     pub stream_reasons: Vec<Vec<String>>,
     /// Reasons for other keys: section to lines.
-    pub reasons: std::collections::BTreeMap<&'static str, Vec<String>>,
+    pub reasons: BTreeMap<&'static str, Vec<String>>,
     /// Topics that are not mapped, and why.
     pub unmapped: Vec<String>,
 }
@@ -99,7 +103,73 @@ pub fn suggest(
     measure::refine(&mut suggestion, &survey, library);
     episodes::guess(&mut suggestion, &survey);
     stream_names::name_streams(&mut suggestion.contract);
+    remove_used(&mut suggestion);
+    name_other_fields(&mut suggestion, &survey);
     Ok(suggestion)
+}
+
+/// Topics that labels, episodes or calibrations come from are used, though they are no columns.
+fn remove_used(suggestion: &mut Suggestion) {
+    let contract = &suggestion.contract;
+    let labels = &contract.labels;
+    let of_labels = [&labels.task, &labels.success, &labels.operator, &labels.robot, &labels.session];
+    let of_labels = of_labels.into_iter().flatten().filter_map(|source| match source {
+        LabelSource::Topic(label) => Some(&label.topic),
+        _ => None,
+    });
+    let infos = contract.stream.iter().filter_map(|stream| stream.image.as_ref()?.camera_info.as_ref());
+    let used: Vec<String> =
+        of_labels.chain(&contract.episodes.topic).chain(infos).map(|topic| format!("{topic} (")).collect();
+    suggestion.unmapped.retain(|line| !used.iter().any(|topic| line.starts_with(topic)));
+}
+
+/// Names the numbers of mapped topics that are no columns.
+fn name_other_fields(suggestion: &mut Suggestion, survey: &survey::Survey) {
+    let mut taken: BTreeMap<&str, BTreeSet<String>> = BTreeMap::new();
+    for stream in suggestion.contract.stream.iter().filter(|stream| !stream.fields.is_empty()) {
+        if let Some(topic) = &stream.topic {
+            taken.entry(topic).or_default().extend(stream.fields.iter().map(|field| leaf_of(field)));
+        }
+    }
+    let mut lines = Vec::new();
+    for (name, taken) in taken {
+        let Some(topic) = survey.topics.get(name) else { continue };
+        let is_taken = |path: &str| {
+            taken.iter().any(|leaf| {
+                path.strip_prefix(leaf.as_str())
+                    .is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '[']))
+            })
+        };
+        let is_number = |field: &&FieldInfo| field.scalar.is_some_and(|scalar| scalar != Scalar::Text);
+        let others: Vec<&str> = topic
+            .fields
+            .iter()
+            .filter(is_number)
+            .map(|field| field.path.as_str())
+            .filter(|path| !is_taken(path) && !names::is_bookkeeping(path))
+            .filter(|path| !path.contains("stamp.") && !names::is_setting(topic.type_name(), path))
+            .collect();
+        if !others.is_empty() {
+            let more = if others.len() > MAX_OTHERS { ", ..." } else { "" };
+            let shown = others[..others.len().min(MAX_OTHERS)].join(", ");
+            lines.push(format!("{name} also holds {shown}{more}"));
+        }
+    }
+    suggestion.unmapped.extend(lines);
+}
+
+/// Returns a path as lists of fields have it: `joints[name="a"].q[0:3]` is `joints[].q[]`.
+fn leaf_of(field: &str) -> String {
+    let Ok(path) = field.parse::<FieldPath>() else { return field.to_owned() };
+    let mut leaf = String::new();
+    for segment in path.segments() {
+        match segment {
+            Segment::Field(name) if leaf.is_empty() => leaf.push_str(name),
+            Segment::Field(name) => leaf.extend([".", name]),
+            _ => leaf.push_str("[]"),
+        }
+    }
+    leaf
 }
 
 /// Suggests from the first input, if that is a table or a LeRobot folder.

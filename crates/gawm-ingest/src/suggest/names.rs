@@ -59,6 +59,27 @@ pub(crate) fn is_gripper(name: &str) -> bool {
     has(name, &["gripper", "grippers", "finger", "fingers", "grip", "jaw", "hand"])
 }
 
+/// Returns the unit that the end of a name says: `opening_mm`, `speed_rad_s`.
+pub(crate) fn unit_of(path: &str) -> Option<&'static str> {
+    let name = path.trim_end_matches("[]").to_lowercase();
+    let units = [
+        ("_rad_s", "rad/s"),
+        ("_rad_per_s", "rad/s"),
+        ("_deg_s", "deg/s"),
+        ("_deg_per_s", "deg/s"),
+        ("_m_s2", "m/s^2"),
+        ("_mps2", "m/s^2"),
+        ("_m_s", "m/s"),
+        ("_mps", "m/s"),
+        ("_rpm", "rpm"),
+        ("_mm", "mm"),
+        ("_cm", "cm"),
+        ("_nm", "N*m"),
+        ("_m", "m"),
+    ];
+    units.into_iter().find(|(ending, _)| name.ends_with(ending)).map(|(_, unit)| unit)
+}
+
 pub(crate) fn is_delta(name: &str) -> bool {
     has(name, &["delta", "deltas", "relative", "increment", "incremental"])
 }
@@ -68,7 +89,21 @@ pub(crate) fn is_velocity(name: &str) -> bool {
 }
 
 pub(crate) fn is_recording(name: &str) -> bool {
-    has(name, &["recording", "record", "episode", "episodes", "is_recording", "rec", "trial", "demo"])
+    let words = [
+        "recording",
+        "recorder",
+        "record",
+        "rec",
+        "episode",
+        "episodes",
+        "trial",
+        "trials",
+        "demo",
+        "demonstration",
+        "rollout",
+        "rollouts",
+    ];
+    has(name, &words)
 }
 
 pub(crate) fn is_reward(name: &str) -> bool {
@@ -167,6 +202,12 @@ pub(crate) fn is_bookkeeping(path: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn units_of_names() {
+        let units = ["opening_mm", "arm.tip_m_s", "wheels_rpm[]", "Torque_Nm", "sum", "q_m"].map(unit_of);
+        assert_eq!(units, [Some("mm"), Some("m/s"), Some("rpm"), Some("N*m"), None, Some("m")]);
+    }
 
     #[test]
     fn words_of_names() {

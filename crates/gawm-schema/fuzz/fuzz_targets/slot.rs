@@ -2,10 +2,25 @@
 #![no_main]
 
 use gawm_schema::ContentHash;
-use gawm_schema::batch::{BatchLayout, BatchShape, BatchView, SLOT_HEADER_BYTES};
+use gawm_schema::batch::{BatchId, BatchLayout, BatchShape, BatchView, SLOT_HEADER_BYTES, SlotHeader, Split};
 use libfuzzer_sys::fuzz_target;
 
+fn header() -> SlotHeader {
+    SlotHeader {
+        schema_hash: ContentHash::of(b"schema"),
+        stream_hash: ContentHash::of(b"stream"),
+        n: 1,
+        batch: BatchId { split: Split::Train, epoch: 0, step: 1 },
+        loader: 1,
+        loaders: 2,
+        rank: 0,
+        ranks: 1,
+        clips: 3,
+    }
+}
+
 fuzz_target!(|data: &[u8]| {
+    let [flags, data @ ..] = data else { return };
     let shape = BatchShape {
         clips: 3,
         frames: 2,
@@ -20,9 +35,15 @@ fuzz_target!(|data: &[u8]| {
     let mut memory = vec![0; data.len() + 64];
     let start = memory.as_ptr().align_offset(64);
     let slot = &mut memory[start..start + data.len()];
-    slot.copy_from_slice(data);
+    // Half of the inputs say what differs from a good slot, so that more than the magic is reached.
+    if flags & 2 == 2 && data.len() >= SLOT_HEADER_BYTES {
+        header().write(&layout, slot);
+    }
+    for (byte, change) in slot.iter_mut().zip(data) {
+        *byte ^= change;
+    }
     // Every second input gets a right checksum, so that the fields behind it are reached.
-    if data.len() >= SLOT_HEADER_BYTES && data[data.len() - 1] & 1 == 1 {
+    if flags & 1 == 1 && data.len() >= SLOT_HEADER_BYTES {
         let checksum = ContentHash::of(&slot[..288]);
         slot[288..SLOT_HEADER_BYTES].copy_from_slice(&checksum.0);
     }

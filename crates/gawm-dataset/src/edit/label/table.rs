@@ -10,7 +10,8 @@ use gawm_schema::batch::Split;
 use serde::de::{Deserialize, Deserializer, MapAccess, Visitor};
 use serde_json::Value;
 
-use super::{Label, LabelError, LabelValue, csv};
+use super::{Label, LabelError, LabelValue};
+use crate::csv;
 
 /// Most bytes of a table.
 const MAX_BYTES: u64 = 64 << 20;

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeSet;
 
-use super::csv::quoted;
 use super::{Input, Label, LabelValue, current_labels, split_name};
+use crate::csv::quoted;
 
 /// Returns CSV with one row per episode: its names and present labels.
 pub fn template(input: &Input) -> String {

@@ -261,3 +261,12 @@ fn a_log_without_messages_is_a_log() {
         assert!(reading.log.blocks().iter().all(|block| block.kind == BlockKind::Chunk));
     }
 }
+
+#[test]
+fn a_log_behind_a_log_is_not_passed_over_in_silence() {
+    for layout in LAYOUTS {
+        let reading = read(&[layout.write(), layout.write()].concat());
+        assert!(reading.kinds().contains(&DamageKind::TrailingBytes), "{layout:?}: {:?}", reading.damage);
+        assert_eq!(reading.messages.len(), 60, "{layout:?}");
+    }
+}

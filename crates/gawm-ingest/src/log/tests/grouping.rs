@@ -80,6 +80,22 @@ fn a_folder_with_metadata_is_one_recording_in_its_order() {
     assert_eq!((found.message_count, found.has_compressed_messages()), (Some(7), true));
 }
 
+#[test]
+fn what_is_named_twice_counts_once() {
+    let folder = folder(&[("a.mcap", ""), ("below/b.mcap", ""), ("none/notes.txt", "")]);
+    let (all, below) = (folder.path().to_owned(), folder.path().join("below"));
+    for inputs in [
+        vec![all.clone(), all.clone()],
+        vec![all.clone(), below.clone()],
+        vec![all.clone(), all.join("a.mcap")],
+    ] {
+        let found = discover(&inputs);
+        assert_eq!((found.recordings.len(), found.refused.len()), (2, 0), "{inputs:?}: {:?}", found.refused);
+    }
+    // A folder without logs is still named.
+    assert_eq!(discover(&[all.clone(), all.join("none")]).refused.len(), 1);
+}
+
 fn check_refused(files: &[(&str, &str)], expected: fn(&OpenLogError) -> bool) {
     let folder = folder(files);
     let found = discover(&[folder.path().into()]);

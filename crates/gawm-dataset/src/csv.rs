@@ -1,15 +1,22 @@
 //! CSV as spreadsheets write it (RFC 4180), with the line that each record begins in.
 
 /// A record: the line it begins in, from 1, and its cells.
-pub(super) type Record = (u64, Vec<String>);
+pub type Record = (u64, Vec<String>);
 
 /// Returns the records of a table; lines without anything are none.
 ///
-/// Cells are separated by commas, or by semicolons or tabs where the first line has these and no comma.
+/// Cells are separated by commas, or by semicolons or tabs where the first line has these and no comma. A byte order
+/// mark at the beginning is passed over.
+///
+/// ```
+/// let records = gawm_dataset::csv::parse("log,task\na.mcap,\"stack, then \"\"wave\"\"\"\n").unwrap();
+/// assert_eq!(records[1], (2, vec!["a.mcap".to_owned(), "stack, then \"wave\"".to_owned()]));
+/// ```
 ///
 /// # Errors
 /// The line, and what is wrong in it.
-pub(super) fn parse(text: &str) -> Result<Vec<Record>, (u64, String)> {
+pub fn parse(text: &str) -> Result<Vec<Record>, (u64, String)> {
+    let text = text.strip_prefix('\u{feff}').unwrap_or(text);
     let header = text.lines().find(|line| !line.trim().is_empty()).unwrap_or_default();
     let delimiter = [',', ';', '\t'].into_iter().find(|delimiter| header.contains(*delimiter)).unwrap_or(',');
     let mut records: Vec<Record> = Vec::new();
@@ -25,7 +32,7 @@ pub(super) fn parse(text: &str) -> Result<Vec<Record>, (u64, String)> {
 }
 
 /// Returns a cell as it is written into a table.
-pub(super) fn quoted(cell: &str) -> String {
+pub(crate) fn quoted(cell: &str) -> String {
     let is_plain = !cell.contains([',', ';', '\t', '"', '\n', '\r']) && cell.trim() == cell;
     if is_plain { cell.to_owned() } else { format!("\"{}\"", cell.replace('"', "\"\"")) }
 }
@@ -119,6 +126,7 @@ mod tests {
             "a,b\n\"x \"\"y\"\"\nz\",2\n3,4\n",
             &[(1, &["a", "b"]), (2, &["x \"y\"\nz", "2"]), (4, &["3", "4"])],
         );
+        check("\u{feff}a,b\n", &[(1, &["a", "b"])]);
         check("a\n\u{e9},\n", &[(1, &["a"]), (2, &["\u{e9}", ""])]);
         check("", &[]);
     }
