@@ -63,12 +63,12 @@ pub(crate) fn guarded<T>(read: impl FnOnce() -> Result<T, String>) -> Result<T, 
 
 /// Opens a Parquet file and checks its footer against the file's size.
 pub(crate) fn open_parquet(path: &Path) -> Result<(File, ArrowReaderMetadata), String> {
-    let file = File::open(path).map_err(|e| e.to_string())?;
-    let size = file.metadata().map_err(|e| e.to_string())?;
-    if !size.is_file() {
+    // Opening a pipe waits for somebody to write into it.
+    if !fs::metadata(path).map_err(|e| e.to_string())?.is_file() {
         return Err("something that is not a regular file".to_owned());
     }
-    let size = size.len();
+    let file = File::open(path).map_err(|e| e.to_string())?;
+    let size = file.metadata().map_err(|e| e.to_string())?.len();
     declared::check_schema(&file, size)?;
     let metadata =
         guarded(|| ArrowReaderMetadata::load(&file, ArrowReaderOptions::new()).map_err(|e| e.to_string()))?;

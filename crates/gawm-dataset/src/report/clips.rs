@@ -43,11 +43,8 @@ pub(super) fn worst_clips(material: &Material<'_>, page: &mut String) {
         }
     }
     if !section.is_empty() {
-        write!(
-            page,
-            "<section id=\"clips\"><h2>Worst clips</h2><div class=\"dims\">{section}</div></section>\n"
-        )
-        .ok();
+        let head = "<section id=\"clips\"><h2>Worst clips</h2><div class=\"dims\">";
+        writeln!(page, "{head}{section}</div></section>").ok();
     }
 }
 

@@ -54,7 +54,7 @@ pub(super) fn overview(material: &Material<'_>, page: &mut String) {
     }
     if let Some(lag) = material.examination.action_lag {
         let name = if lag.rows < 0 { "action comes after its motion" } else { "from action to motion" };
-        facts.push((counted(lag.rows.unsigned_abs() as u64, "row"), name));
+        facts.push((counted(lag.rows.unsigned_abs(), "row"), name));
     }
     page.push_str("<ul class=\"facts\">");
     for (value, name) in facts {
@@ -83,9 +83,9 @@ pub(super) fn alerts(material: &Material<'_>, page: &mut String) {
     write!(
         page,
         "<section id=\"alerts\"><h2>Alerts</h2><p>{}, {}, {}.</p>",
-        counted(counts.error as u64, "error"),
-        counted(counts.warning as u64, "warning"),
-        counted(counts.info as u64, "note")
+        counted(counts.error, "error"),
+        counted(counts.warning, "warning"),
+        counted(counts.info, "note")
     )
     .ok();
     if counts.error + counts.warning == 0 {
@@ -95,7 +95,7 @@ pub(super) fn alerts(material: &Material<'_>, page: &mut String) {
         by_rule(&report.findings).into_iter().partition(|g| g[0].severity == Severity::Info);
     alerts.iter().for_each(|group| alert(material, group, page));
     if !notes.is_empty() {
-        write!(page, "<details><summary>{}</summary>", counted(counts.info as u64, "note")).ok();
+        write!(page, "<details><summary>{}</summary>", counted(counts.info, "note")).ok();
         notes.iter().for_each(|group| alert(material, group, page));
         page.push_str("</details>");
     }

@@ -280,3 +280,63 @@ fn a_stream_that_keeps_rows_from_beginning_is_named() {
     let said = outcome.report.warnings.join("\n");
     assert!(said.contains("\"s1\" (/joints) begins 1.503 s after"), "{said}");
 }
+
+#[test]
+fn messages_with_some_of_the_structs_that_are_picked_are_lost() {
+    let joint = |name: &str, i: u64| format!(r#"{{"name":"{name}","position":{i}}}"#);
+    let mut sent: Vec<Sent> = Vec::new();
+    for i in 0..100 {
+        let joints = match i {
+            40 => joint("a", i),
+            41 => joint("other", i),
+            _ => [joint("b", i), joint("a", i)].join(","),
+        };
+        sent.push(("/joints", 20 * i, format!(r#"{{"joints":[{joints}]}}"#)));
+    }
+    let made = made(&sent);
+    let text = r#"
+        [ticks]
+        rate_hz = 50
+        [[stream]]
+        topic = "/joints"
+        fields = ['joints[name="a"].position', 'joints[name="b"].position']
+        feature = "observation.state"
+        clock = "log"
+        tolerance_ms = 50
+    "#;
+    let contract = contract::check(&contract::parse(text, "t.toml", &[]).unwrap(), "t.toml").unwrap();
+    let outcome = run_of(&contract, &made.log, &made.out).0.unwrap();
+    let topic = &outcome.report.files[0].topics[0];
+    assert_eq!((topic.read, topic.kept, topic.lost.len()), (100, 99, 1), "{topic:#?}");
+    assert_eq!((topic.lost[0].reason.as_str(), topic.lost[0].count), ("name_absent", 1));
+    assert!(outcome.has_loss() && outcome.report.warnings.iter().any(|w| w.contains("1 messages hold none")));
+    let gawm_schema::FeatureData::Vector { parts, .. } = &outcome.schema.features[0].data else { panic!() };
+    assert_eq!(parts[0].dims.iter().map(|dim| dim.name.as_str()).collect::<Vec<_>>(), ["a", "b"]);
+}
+
+#[test]
+fn a_suggestion_takes_the_task_beside_the_episode_marks_and_lists_what_it_leaves_out() {
+    let mut sent: Vec<Sent> = Vec::new();
+    for i in 0..300_u64 {
+        let value = (i as f64 / 20.0).sin();
+        let text = format!(r#"{{"name":["a","b"],"position":[{value},0.5],"velocity":[{i},1]}}"#);
+        sent.push(("/joints", 20 * i, text));
+        sent.push(("/gripper", 20 * i, format!(r#"{{"opening_mm":{}}}"#, i % 40)));
+    }
+    for (ms, task) in [(500, "pick"), (3500, "place")] {
+        sent.push(("/events", ms, format!(r#"{{"event":"start","instruction":"{task}"}}"#)));
+        sent.push(("/events", ms + 2000, r#"{"event":"end","success":true}"#.to_owned()));
+    }
+    sent.sort_by_key(|(_, ms, _)| *ms);
+    let made = made(&sent);
+    let suggestion =
+        suggest(std::slice::from_ref(&made.log), &SchemaLibrary::builtin(), &OpenOptions::default()).unwrap();
+    let text = to_toml(&suggestion);
+    for expected in ["field = \"instruction\"", "unit = \"mm\"", "/joints also holds velocity[]"] {
+        assert!(text.contains(expected), "{expected}: {text}");
+    }
+    assert!(!text.contains("/events (json"), "{text}");
+    let contract = contract::check(&contract::parse(&text, "s.toml", &[]).unwrap(), "s.toml").unwrap();
+    let outcome = run_of(&contract, &made.log, &made.out).0.unwrap();
+    assert_eq!((outcome.report.episodes, outcome.has_loss()), (2, false), "{:#?}", outcome.report);
+}
