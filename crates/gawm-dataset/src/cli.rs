@@ -1,5 +1,13 @@
 //! The command line of `gawm-data`.
 
+/// Writes a line to standard error, where one may be gone: `2>&1 | head` is no reason to panic.
+macro_rules! say {
+    ($($text:tt)*) => {{
+        use std::io::Write;
+        writeln!(std::io::stderr(), $($text)*).ok();
+    }};
+}
+
 mod diff;
 mod edit;
 mod filter;
@@ -16,7 +24,7 @@ mod validate;
 
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 
 use crate::edit::EditError;
 
@@ -50,6 +58,11 @@ enum Verb {
     Split(split::SplitArguments),
     Diff(diff::DiffArguments),
     Standardize(standardize::StandardizeArguments),
+    /// Print a completion script for a shell
+    Completions {
+        /// The shell
+        shell: clap_complete::Shell,
+    },
 }
 
 /// Runs the program and returns its exit code.
@@ -79,18 +92,26 @@ pub fn run(arguments: impl IntoIterator<Item = std::ffi::OsString>) -> ExitCode 
         Verb::Merge(verb) => merge::run(verb, quiet),
         Verb::Split(verb) => split::run(verb, quiet),
         Verb::Diff(verb) => diff::run(verb, quiet),
-        Verb::Standardize(verb) => standardize::run(verb),
+        Verb::Standardize(verb) => standardize::run(verb, quiet),
+        Verb::Completions { shell } => completions(*shell),
     };
     match outcome {
         Ok(code) => ExitCode::from(code),
         Err(failure) => {
-            eprintln!("error: {:#}", failure.error);
+            say!("error: {:#}", failure.error);
             if let Some(hint) = failure.hint {
-                eprintln!("\nhint: {hint}");
+                say!("\nhint: {hint}");
             }
             ExitCode::from(failure.code)
         }
     }
+}
+
+fn completions(shell: clap_complete::Shell) -> Result<u8, Failure> {
+    let mut script = Vec::new();
+    clap_complete::generate(shell, &mut Arguments::command(), "gawm-data", &mut script);
+    print_result(&String::from_utf8_lossy(&script))?;
+    Ok(0)
 }
 
 /// An error with its exit code and what to do.
@@ -154,7 +175,11 @@ pub(crate) fn write_replacing(path: &std::path::Path, bytes: &[u8]) -> std::io::
     // The parent of a bare name is empty.
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
     let folder = folder.unwrap_or_else(|| std::path::Path::new("."));
-    let mut file = tempfile::NamedTempFile::new_in(folder)?;
+    let mut builder = tempfile::Builder::new();
+    // Readable to whom other new files are: temporary ones are private.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    let mut file = builder.tempfile_in(folder)?;
     file.write_all(bytes)?;
     file.as_file().sync_all()?;
     file.persist(path)?;

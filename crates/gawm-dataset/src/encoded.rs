@@ -8,8 +8,6 @@ use arrow::array::{ArrayRef, Int64Array, RecordBatch};
 use arrow::datatypes::{DataType, Field, Schema as ArrowSchema, SchemaRef};
 use gawm_schema::Standardisation;
 use parquet::arrow::ArrowWriter;
-use parquet::arrow::ProjectionMask;
-use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
 use crate::block::{StoredValues, vector_array};
 use crate::columns::{item_field, numeric_properties};
@@ -18,6 +16,7 @@ use crate::error::WriteError;
 use crate::journal::load;
 use crate::layout::{ENCODED, GAWM, data_path, encoded_path};
 use crate::provenance::GawmMeta;
+use crate::read::checked_builder;
 use crate::scan::{column, vector_values};
 
 /// Columns that say which row it is.
@@ -61,16 +60,10 @@ fn encode_file(
     disk: &Disk,
     standardisation: &[Standardisation],
 ) -> Result<(), WriteError> {
-    let file = File::open(source).map_err(WriteError::io("open", source))?;
-    let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(WriteError::parquet(source))?;
-    let arrow = builder.schema().clone();
+    File::open(source).map_err(WriteError::io("open", source))?;
     let is_wanted = |name: &str| KEYS.contains(&name) || standardisation.iter().any(|s| s.column == name);
-    let wanted = (0..arrow.fields().len()).filter(|&i| is_wanted(arrow.field(i).name()));
-    let mask = ProjectionMask::roots(builder.parquet_schema(), wanted);
-    let reader = builder
-        .with_projection(mask)
-        .with_batch_size(BATCH_ROWS)
-        .build()
+    let reader = checked_builder(source, is_wanted)
+        .and_then(|builder| builder.with_batch_size(BATCH_ROWS).build())
         .map_err(WriteError::parquet(source))?;
     let schema = encoded_schema(standardisation);
     let new = disk.create(target).map_err(WriteError::io("create", target))?;

@@ -7,6 +7,7 @@
 //! A [`Run`] is a stretch of consecutive rows with one `episode_index` in one data file: in a sound dataset, an episode.
 
 mod column;
+mod declared;
 mod defect;
 mod episode_table;
 mod files;
@@ -16,6 +17,7 @@ mod mp4;
 mod paths;
 mod scan;
 
+pub(crate) use declared::{check_pages, checked_builder};
 pub(crate) use episode_table::episode_statistics;
 pub(crate) use files::{guarded, open_parquet};
 pub(crate) use info::read_json;

@@ -4,7 +4,9 @@
 //! 5 MB: what there is more of than fits is counted, not shown.
 
 mod chart;
+mod clips;
 mod sections;
+mod streams;
 
 use std::fmt::Write;
 
@@ -32,6 +34,17 @@ struct Material<'a> {
 /// Forbids the page to load anything, whatever a dataset managed to put into it.
 pub(crate) const POLICY: &str = "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:\">";
 const STYLE: &str = include_str!("report/style.css");
+/// Sections by their ids, in order.
+const SECTIONS: [(&str, &str); 6] = [
+    ("alerts", "Alerts"),
+    ("clips", "Worst clips"),
+    ("streams", "Streams"),
+    ("dims", "Dims"),
+    ("episodes", "Episodes"),
+    ("cameras", "Cameras"),
+];
+/// Characters of a text that are shown: a name of megabytes must not fill the page.
+const SHOWN_CHARS: usize = 400;
 const SCRIPT: &str = include_str!("report/sort.js");
 
 /// Renders the page.
@@ -54,22 +67,33 @@ pub fn render_report(dataset: &Dataset, options: ReportOptions) -> Result<String
          {POLICY}<meta name=\"color-scheme\" content=\"light dark\"><title>{title}: gawm report</title>\n<style>{STYLE}</style></head>\n<body>\n<header><h1>{title}</h1>"
     )
     .ok();
+    let timing = streams::measure(&material);
+    let mut body = String::with_capacity(1 << 20);
+    sections::alerts(&material, &mut body);
+    clips::worst_clips(&material, &mut body);
+    streams::streams(&material, timing.as_ref(), &mut body);
+    sections::dims(&material, &mut body);
+    sections::episodes(&material, &mut body);
+    sections::cameras(&material, timing.as_ref(), &mut body);
     sections::overview(&material, &mut page);
-    page.push_str("</header>\n<main>\n");
-    sections::alerts(&material, &mut page);
-    sections::worst_clips(&material, &mut page);
-    sections::streams(&material, &mut page);
-    sections::dims(&material, &mut page);
-    sections::episodes(&material, &mut page);
-    sections::cameras(&material, &mut page);
+    page.push_str("<nav>");
+    for (id, name) in SECTIONS.iter().filter(|(id, _)| body.contains(&format!("<section id=\"{id}\">"))) {
+        write!(page, "<a href=\"#{id}\">{name}</a> ").ok();
+    }
+    page.push_str("</nav></header>\n<main>\n");
+    page.push_str(&body);
     write!(page, "</main>\n<script>{SCRIPT}</script>\n</body></html>\n").ok();
     Ok(page)
 }
 
-/// Makes text safe inside HTML and its attributes.
+/// Makes text safe inside HTML and its attributes, and cuts one that is very long.
 pub(crate) fn escape(text: &str) -> String {
-    let mut out = String::with_capacity(text.len());
-    for c in text.chars() {
+    let mut out = String::with_capacity(text.len().min(4 * SHOWN_CHARS));
+    for (i, c) in text.chars().enumerate() {
+        if i == SHOWN_CHARS {
+            out.push_str("...");
+            break;
+        }
         match c {
             '&' => out.push_str("&amp;"),
             '<' => out.push_str("&lt;"),
@@ -89,5 +113,6 @@ mod tests {
     #[test]
     fn hostile_names_do_not_become_markup() {
         assert_eq!(escape("<script>\"a\"&'b'"), "&lt;script&gt;&quot;a&quot;&amp;&#39;b&#39;");
+        assert_eq!(escape(&"<".repeat(1_000_000)).len(), 4 * SHOWN_CHARS + 3);
     }
 }

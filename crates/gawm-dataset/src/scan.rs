@@ -7,8 +7,6 @@ use std::sync::Arc;
 use arrow::array::{
     Array, ArrayRef, BooleanArray, Float32Array, Float64Array, Int64Array, ListArray, RecordBatch,
 };
-use parquet::arrow::ProjectionMask;
-use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
 use crate::block::{RowBlock, StoredValues};
 use crate::columns::Columns;
@@ -17,6 +15,7 @@ use crate::episode::EpisodeRecord;
 use crate::error::WriteError;
 use crate::layout::{VALID, data_path};
 use crate::provenance::RecordingRecord;
+use crate::read::checked_builder;
 use crate::totals::Totals;
 
 /// Rows that are read at once.
@@ -56,22 +55,15 @@ struct Scan<'a> {
 impl Scan<'_> {
     fn file(&mut self, path: &Path, frames: u64) -> Result<(), WriteError> {
         let damaged = |reason: String| WriteError::Damaged { path: path.to_owned(), reason };
-        let file = File::open(path).map_err(WriteError::io("open", path))?;
-        let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(WriteError::parquet(path))?;
+        File::open(path).map_err(WriteError::io("open", path))?;
+        let images: Vec<&str> = self.columns.images.iter().map(|image| image.name.as_str()).collect();
+        let builder =
+            checked_builder(path, |name| !images.contains(&name)).map_err(WriteError::parquet(path))?;
         let n_rows = builder.metadata().file_metadata().num_rows();
         if u64::try_from(n_rows) != Ok(frames) {
             return Err(damaged(format!("expected {frames} rows, got {n_rows}")));
         }
-        let images: Vec<&str> = self.columns.images.iter().map(|image| image.name.as_str()).collect();
-        let schema = builder.schema().clone();
-        let wanted =
-            (0..schema.fields().len()).filter(|&i| !images.contains(&schema.field(i).name().as_str()));
-        let mask = ProjectionMask::roots(builder.parquet_schema(), wanted);
-        let reader = builder
-            .with_projection(mask)
-            .with_batch_size(BATCH_ROWS)
-            .build()
-            .map_err(WriteError::parquet(path))?;
+        let reader = builder.with_batch_size(BATCH_ROWS).build().map_err(WriteError::parquet(path))?;
         for batch in reader {
             let batch = batch.map_err(|error| WriteError::parquet(path)(error.into()))?;
             self.batch(&batch).map_err(damaged)?;

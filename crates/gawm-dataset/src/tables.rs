@@ -19,6 +19,7 @@ use crate::columns::{item_field, numeric_properties};
 use crate::episode::{EpisodeRecord, FeatureStats};
 use crate::error::WriteError;
 use crate::layout::file_position;
+use crate::read::checked_builder;
 
 /// What pandas needs to make `task` the index; LeRobot looks tasks up by it.
 const PANDAS: &str = r#"{"index_columns":["task"],"column_indexes":[],"columns":[{"name":"task_index","field_name":"task_index","pandas_type":"int64","numpy_type":"int64","metadata":null},{"name":"task","field_name":"task","pandas_type":"unicode","numpy_type":"object","metadata":null}],"creator":{"library":"gawm","version":"1"},"pandas_version":"2.2.0"}"#;
@@ -182,8 +183,8 @@ fn damaged(path: &Path, reason: String) -> WriteError {
 }
 
 fn read_batches(path: &Path) -> Result<Vec<RecordBatch>, WriteError> {
-    let file = File::open(path).map_err(WriteError::io("open", path))?;
-    let reader = ParquetRecordBatchReaderBuilder::try_new(file)
+    File::open(path).map_err(WriteError::io("open", path))?;
+    let reader = checked_builder(path, |_| true)
         .and_then(ParquetRecordBatchReaderBuilder::build)
         .map_err(WriteError::parquet(path))?;
     reader.collect::<Result<_, _>>().map_err(|error| WriteError::parquet(path)(error.into()))

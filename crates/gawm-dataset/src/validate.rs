@@ -16,6 +16,7 @@ mod motion;
 mod probe;
 mod profile;
 mod render;
+mod rest;
 mod robust;
 mod rotations;
 mod row_checks;

@@ -124,6 +124,32 @@ fn the_report_sorts_and_loads_nothing() {
 }
 
 #[test]
+fn the_report_tells_streams_and_encodings_and_keeps_secrets() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path().join("pc7-dataset");
+    write_dataset(&dir);
+    let episodes = dir.join("meta/info.json");
+    let info = fs::read_to_string(&episodes).unwrap();
+    fs::write(&episodes, info.replace("\"total_frames\": 63", "\"total_frames\": 64")).unwrap();
+    let dataset = Dataset::open(&dir, ReadLimits::default()).unwrap();
+    let page = render_report(&dataset, ReportOptions::default()).unwrap();
+    for part in [
+        "<p>1 error,",
+        "STRUCT-013",
+        // Rate, longest gap and ages of a stream whose samples are as old in each row.
+        "<tr><td>joints</td><td>10.0</td><td>100.0</td><td>3.0</td>",
+        "<small>linear, kept as it is; mean",
+        "<summary>gawm.state (encoded)</summary>",
+        "<a href=\"#episodes\">Episodes</a>",
+        "<h1>pc7-dataset</h1>",
+    ] {
+        assert!(page.contains(part), "{part}");
+    }
+    let shared = render_report(&dataset, ReportOptions { is_shared: true }).unwrap();
+    assert!(!shared.contains("pc7") && !shared.contains(folder.path().to_str().unwrap()));
+}
+
+#[test]
 fn the_preview_fits_and_loads_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let dir = folder.path().join("dataset");

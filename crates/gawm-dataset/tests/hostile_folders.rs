@@ -260,3 +260,25 @@ fn hostile_metadata_are_named() {
     let deep = format!("\"robot_type\": {}{}", "[".repeat(50_000), "]".repeat(50_000));
     check_hostile(info, "\"robot_type\": null", &deep, "recursion");
 }
+
+/// Puts a pipe, whose opening would wait for ever, at the place of a file.
+#[cfg(unix)]
+fn check_pipe(file: &str) {
+    let folder = tempfile::tempdir().unwrap();
+    let (dir, out) = (folder.path().join("in"), folder.path().join("out"));
+    write_dataset(&dir);
+    fs::create_dir(&out).unwrap();
+    fs::remove_file(dir.join(file)).ok();
+    assert!(std::process::Command::new("mkfifo").arg(dir.join(file)).status().unwrap().success());
+    run_all(&dir, &out);
+}
+
+#[cfg(unix)]
+#[test]
+fn pipes_are_not_waited_for() {
+    for file in ["meta/info.json", "meta/gawm.json", "meta/stats.json", "meta/tasks.parquet"] {
+        check_pipe(file);
+    }
+    check_pipe("data/chunk-000/file-000.parquet");
+    check_pipe("meta/episodes/chunk-000/file-000.parquet");
+}

@@ -14,6 +14,9 @@ use crate::run::{Run, RunError};
 use crate::statistics::{Interval, PairedDifference, paired_difference, wilson};
 use crate::world::World;
 
+/// Share of the range of an action by which recorded commands may leave it; environments clip them.
+const ACTION_SLACK: f64 = 0.25;
+
 /// Version of `plan.json`.
 pub const PLAN_VERSION: u32 = 1;
 
@@ -258,6 +261,21 @@ pub enum SuiteError {
         /// The model's.
         got: usize,
     },
+    /// The model was trained on larger actions than the environment has.
+    #[error(
+        "the model was trained on actions of another task: expected {dim} from {} to {} as {task} has, got {:.3} to {:.3}",
+        expected.0, expected.1, got.0, got.1
+    )]
+    ActionRange {
+        /// The environment.
+        task: &'static str,
+        /// The dim of the action.
+        dim: String,
+        /// The environment's smallest and largest value.
+        expected: (f64, f64),
+        /// Those of the training data.
+        got: (f64, f64),
+    },
     /// A weight needs a head that the model has not.
     #[error("planner.objective.state needs a state head, and this model has none (model.state_head)")]
     NoStateHead,
@@ -368,6 +386,33 @@ fn space_of(run: &Run, spec: &gawm_sim::EnvironmentSpec) -> ActionSpace {
     ActionSpace::new(spec, run.action_standardisation(), run.hello.frameskip)
 }
 
+/// Refuses a model that cannot act in an environment, and settings that it cannot be planned with.
+fn check_fit(run: &Run, spec: &gawm_sim::EnvironmentSpec, config: &PlannerConfig) -> Result<(), SuiteError> {
+    let (expected, got) = (spec.action.len(), run.hello.action.dims.len());
+    if expected != got {
+        return Err(SuiteError::ActionWidth { task: spec.name, expected, got });
+    }
+    for (axis, dim) in spec.action.iter().zip(&run.hello.action.dims) {
+        let (low, high) = (dim.mean + dim.scale * dim.min, dim.mean + dim.scale * dim.max);
+        let slack = ACTION_SLACK * (axis.high - axis.low);
+        if low < axis.low - slack || high > axis.high + slack {
+            let (dim, expected, got) = (dim.name.clone(), (axis.low, axis.high), (low, high));
+            return Err(SuiteError::ActionRange { task: spec.name, dim, expected, got });
+        }
+    }
+    let architecture = run.model.architecture();
+    let model = architecture.config();
+    if config.objective.state > 0.0 && !(model.state_head && architecture.widths().state > 0) {
+        return Err(SuiteError::NoStateHead);
+    }
+    if config.history > model.predictor.history {
+        let got = format!("{} where the model sees {}", config.history, model.predictor.history);
+        let expected = "1 to the history of the model";
+        return Err(PlannerConfigError { field: "history", expected, got }.into());
+    }
+    Ok(())
+}
+
 /// Plans over the world model of a run.
 ///
 /// # Errors
@@ -379,15 +424,7 @@ pub fn latent_agent<'a>(
 ) -> Result<PlanningAgent<'a>, SuiteError> {
     let environment = world.environment();
     let spec = environment.spec();
-    let (expected, got) = (spec.action.len(), run.hello.action.dims.len());
-    if expected != got {
-        return Err(SuiteError::ActionWidth { task: spec.name, expected, got });
-    }
-    let architecture = run.model.architecture();
-    if config.objective.state > 0.0 && !(architecture.config().state_head && architecture.widths().state > 0)
-    {
-        return Err(SuiteError::NoStateHead);
-    }
+    check_fit(run, spec, config)?;
     let space = space_of(run, spec);
     let dynamics = LatentDynamics::new(&run.model, world, space.clone(), run.image_size(), config);
     Ok(PlanningAgent::new(planner(config, &space)?, Box::new(dynamics), space, config.clone()))

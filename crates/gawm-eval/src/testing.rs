@@ -23,8 +23,8 @@ pub(crate) fn feature(feature: &str, mean: f64, scale: f64) -> EncodedFeature {
         mean,
         scale,
         is_constant: false,
-        min: -3.0,
-        max: 3.0,
+        min: -1.5,
+        max: 1.5,
     };
     EncodedFeature {
         dims: vec![dim("x"), dim("y")],

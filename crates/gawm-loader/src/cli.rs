@@ -132,7 +132,11 @@ pub(crate) struct Failure {
 
 impl From<LoadError> for Failure {
     fn from(error: LoadError) -> Failure {
-        let code = if matches!(error, LoadError::Interrupted) { 130 } else { 1 };
+        let code = match error {
+            LoadError::Interrupted => 130,
+            _ if error.is_misfit() => 2,
+            _ => 1,
+        };
         Failure { code, hint: error.hint(), error: error.into() }
     }
 }

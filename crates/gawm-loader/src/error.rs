@@ -10,7 +10,7 @@ use gawm_schema::batch::{BatchError, SequenceError};
 #[non_exhaustive]
 pub enum LoadError {
     /// The dataset cannot be opened.
-    #[error("{0}")]
+    #[error(transparent)]
     Open(#[from] gawm_dataset::read::OpenError),
     /// The dataset is not one that can be trained on.
     #[error("unusable dataset {}: expected {expected}, got {got}", path.display())]
@@ -122,6 +122,19 @@ impl LoadError {
 
     pub(crate) fn dataset(path: &Path, expected: impl Into<String>, got: impl Into<String>) -> LoadError {
         LoadError::Dataset { path: path.to_owned(), expected: expected.into(), got: got.into() }
+    }
+
+    /// Whether configuration and data do not fit together: the user must change one of them.
+    pub(crate) fn is_misfit(&self) -> bool {
+        matches!(
+            self,
+            LoadError::Dataset { .. }
+                | LoadError::Mix { .. }
+                | LoadError::TooFewClips { .. }
+                | LoadError::Batch(_)
+                | LoadError::Sequence(_)
+                | LoadError::CacheBudget { .. }
+        )
     }
 
     /// Returns what a user can do about it.

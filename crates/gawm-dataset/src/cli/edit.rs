@@ -80,9 +80,9 @@ impl EditArguments {
     ) -> Result<u8, Failure> {
         let left_out: Vec<&String> = inputs.iter().flat_map(|input| &input.notes).collect();
         if !quiet {
-            left_out.iter().for_each(|note| eprintln!("warning: {note}"));
+            left_out.iter().for_each(|note| say!("warning: {note}"));
             let notes: BTreeSet<&String> = written.iter().flat_map(|w| &w.summary.notes).collect();
-            notes.iter().for_each(|note| eprintln!("note: {note}"));
+            notes.iter().for_each(|note| say!("note: {note}"));
         }
         let text = match self.format {
             Format::Json => {

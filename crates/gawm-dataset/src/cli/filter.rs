@@ -51,7 +51,7 @@ pub(super) fn run(arguments: &FilterArguments, quiet: bool) -> Result<u8, Failur
     let plan = filter(&input, condition)?;
     let kept: Vec<i64> = plan.pieces.iter().map(|p| input.dataset.runs[p.run].episode_index).collect();
     if arguments.edit.dry_run && arguments.edit.format == Format::Text && !quiet {
-        eprintln!("episodes {kept:?}");
+        say!("episodes {kept:?}");
     }
     let out = arguments.out.clone().unwrap_or_else(|| PathBuf::from("(nothing)"));
     let inputs = [input];

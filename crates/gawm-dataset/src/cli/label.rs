@@ -67,10 +67,10 @@ pub(super) fn run(arguments: &LabelArguments, quiet: bool) -> Result<u8, Failure
     let changes = changes(&plan, |run| inputs[0].dataset.runs[run].episode_index);
     if arguments.format == Format::Text && !quiet {
         if changes.is_empty() {
-            eprintln!("note: all labels are as the table says already");
+            say!("note: all labels are as the table says already");
         }
         if arguments.dry_run {
-            changes.iter().for_each(|(episode, labels)| eprintln!("episode {episode}: {labels}"));
+            changes.iter().for_each(|(episode, labels)| say!("episode {episode}: {labels}"));
         }
     }
     let out = arguments.out.clone().unwrap_or_else(|| PathBuf::from("(nothing)"));

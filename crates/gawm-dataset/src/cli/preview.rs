@@ -77,7 +77,7 @@ pub(super) fn run(arguments: &PreviewArguments, quiet: bool) -> Result<u8, Failu
     super::write_replacing(&arguments.out, &bytes)
         .with_context(|| format!("cannot write {}", arguments.out.display()))?;
     if !quiet {
-        eprintln!("wrote {} ({} kB)", arguments.out.display(), bytes.len().div_ceil(1024));
+        say!("wrote {} ({} kB)", arguments.out.display(), bytes.len().div_ceil(1024));
     }
     Ok(0)
 }

@@ -30,7 +30,7 @@ pub(super) fn run(arguments: &ReportArguments, quiet: bool) -> Result<u8, Failur
     super::write_replacing(&arguments.out, page.as_bytes())
         .with_context(|| format!("cannot write {}", arguments.out.display()))?;
     if !quiet {
-        eprintln!("wrote {} ({} kB)", arguments.out.display(), page.len() / 1024);
+        say!("wrote {} ({} kB)", arguments.out.display(), page.len() / 1024);
     }
     Ok(0)
 }

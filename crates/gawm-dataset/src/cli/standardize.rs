@@ -13,7 +13,7 @@ pub(super) struct StandardizeArguments {
     dir: PathBuf,
 }
 
-pub(super) fn run(arguments: &StandardizeArguments) -> Result<u8, Failure> {
+pub(super) fn run(arguments: &StandardizeArguments, quiet: bool) -> Result<u8, Failure> {
     let dataset = open(&arguments.dir)?;
     if dataset.gawm.is_none() {
         let error = anyhow::anyhow!(
@@ -23,6 +23,8 @@ pub(super) fn run(arguments: &StandardizeArguments) -> Result<u8, Failure> {
         return Err(Failure::from(error).hint("only datasets written by gawm have a standardisation"));
     }
     crate::standardize(&arguments.dir)?;
-    eprintln!("wrote {}", arguments.dir.join(crate::layout::ENCODED).display());
+    if !quiet {
+        say!("wrote {}", arguments.dir.join(crate::layout::ENCODED).display());
+    }
     Ok(0)
 }

@@ -45,10 +45,10 @@ pub(super) fn run(arguments: &StatsArguments, quiet: bool) -> Result<u8, Failure
         let path = arguments.dir.join("meta/stats.json");
         super::write_replacing(&path, text.as_bytes())
             .with_context(|| format!("cannot write {}", path.display()))?;
-        eprintln!("wrote {}", path.display());
+        say!("wrote {}", path.display());
     }
     for defect in &stats.defects {
-        eprintln!("error: {}: expected {}, got {}", defect.place, defect.expected, defect.got);
+        say!("error: {}: expected {}, got {}", defect.place, defect.expected, defect.got);
     }
     Ok(if stats.defects.is_empty() { 0 } else { EXIT_CHECK_FAILED })
 }

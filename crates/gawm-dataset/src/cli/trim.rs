@@ -41,7 +41,8 @@ pub(super) fn run(arguments: &TrimArguments, quiet: bool) -> Result<u8, Failure>
         ("--min-cut-s", arguments.min_cut_s, f64::MAX),
     ] {
         if !(0.0..=max).contains(&value) {
-            let error = anyhow::anyhow!("{name}: expected a number of 0 or more, got {value}");
+            let expected = if max == 1.0 { "a share from 0 to 1" } else { "a number of 0 or more" };
+            let error = anyhow::anyhow!("{name}: expected {expected}, got {value}");
             return Err(Failure::usage(error));
         }
     }
@@ -55,15 +56,15 @@ pub(super) fn run(arguments: &TrimArguments, quiet: bool) -> Result<u8, Failure>
     if arguments.edit.format == Format::Text && !quiet {
         let cut = trimmed.iter().filter(|t| t.kept.end - t.kept.start < t.rows);
         for t in cut.take(50) {
-            eprintln!("episode {}: rows {} to {} of {}", t.episode, t.kept.start, t.kept.end, t.rows);
+            say!("episode {}: rows {} to {} of {}", t.episode, t.kept.start, t.kept.end, t.rows);
         }
         let n_cut = trimmed.iter().filter(|t| t.kept.end - t.kept.start < t.rows).count();
         if n_cut > 50 {
-            eprintln!("and {} more episodes", n_cut - 50);
+            say!("and {} more episodes", n_cut - 50);
         }
-        eprintln!("{n_cut} of {} episodes have idle ends", trimmed.len());
+        say!("{n_cut} of {} episodes have idle ends", trimmed.len());
         for t in trimmed.iter().filter(|t| t.is_idle).take(20) {
-            eprintln!("note: nothing moves in episode {}: it is kept whole", t.episode);
+            say!("note: nothing moves in episode {}: it is kept whole", t.episode);
         }
     }
     let out = arguments.out.clone().unwrap_or_else(|| PathBuf::from("(nothing)"));

@@ -47,7 +47,7 @@ pub enum ConditionError {
         max: usize,
     },
     /// A name stands for nothing.
-    #[error("in --where: unknown name {name:?}{}; there are: {}", suggestion(.near), .known.join(", "))]
+    #[error("in --where: unknown name {name:?}{}; {}", suggestion(.near), listed(.known))]
     UnknownName {
         /// The name.
         name: String,
@@ -82,6 +82,14 @@ pub enum ConditionError {
 
 fn suggestion(near: &Option<String>) -> String {
     near.as_ref().map_or(String::new(), |near| format!(" (did you mean {near:?}?)"))
+}
+
+/// Names the plain names; statistics of dims are too many for a message.
+fn listed(known: &[String]) -> String {
+    let plain: Vec<&str> = known.iter().map(String::as_str).filter(|name| !name.contains('(')).collect();
+    let has_statistics = plain.len() < known.len();
+    let rest = if has_statistics { ", and statistics such as mean(action[0])" } else { "" };
+    format!("there are: {}{rest}; --list-names shows all with their values", plain.join(", "))
 }
 
 /// A value of an episode.

@@ -4,7 +4,7 @@ use arrow::array::RecordBatch;
 use parquet::arrow::arrow_reader::{ParquetRecordBatchReaderBuilder, RowSelection, RowSelector};
 
 use super::{EditError, Input, Piece};
-use crate::read::{guarded, open_parquet};
+use crate::read::{check_pages, guarded, open_parquet};
 
 /// Bytes that a batch aims at.
 const BATCH_BYTES: u64 = 8 << 20;
@@ -66,10 +66,12 @@ fn open(
         RowSelector::skip((from - skipped) as usize),
         RowSelector::select((to - from) as usize),
     ]);
+    let mask = parquet::arrow::ProjectionMask::all();
+    let most_rows = check_pages(&handle, metadata.metadata(), groups.iter().copied(), &mask)?;
     ParquetRecordBatchReaderBuilder::new_with_metadata(handle, metadata)
         .with_row_groups(groups)
         .with_row_selection(selection)
-        .with_batch_size(batch_rows as usize)
+        .with_batch_size(most_rows.min(batch_rows as usize))
         .build()
         .map_err(|error| error.to_string())
 }

@@ -11,7 +11,7 @@ use serde_json::Value;
 
 use crate::episode::FeatureStats;
 
-use super::{Column, DataFile, Defect, DefectKind, Info, ReadLimits, Run, files, info, paths};
+use super::{Column, DataFile, Defect, DefectKind, Info, ReadLimits, Run, declared, files, info, paths};
 
 /// Most defects of one kind that are listed one by one.
 const MAX_LISTED: usize = 50;
@@ -405,11 +405,14 @@ fn read_table(path: &Path, wants: impl Fn(&str) -> bool) -> Result<(Vec<RecordBa
     }
     let (file, metadata) = files::open_parquet(path)?;
     files::guarded(|| {
-        let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(file, metadata);
-        let schema = builder.schema().as_ref().clone();
+        let schema = metadata.schema().as_ref().clone();
         let roots = schema.fields().iter().enumerate().filter(|(_, f)| wants(f.name())).map(|(i, _)| i);
-        let mask = ProjectionMask::roots(builder.parquet_schema(), roots);
-        let reader = builder.with_projection(mask).build().map_err(|e| e.to_string())?;
+        let mask = ProjectionMask::roots(metadata.parquet_schema(), roots);
+        let groups = 0..metadata.metadata().num_row_groups();
+        let most_rows = declared::check_pages(&file, metadata.metadata(), groups, &mask)?;
+        let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(file, metadata);
+        let reader = builder.with_projection(mask).with_batch_size(most_rows.min(1024));
+        let reader = reader.build().map_err(|e| e.to_string())?;
         let batches = reader.collect::<Result<Vec<_>, _>>().map_err(|e| e.to_string())?;
         Ok((batches, schema))
     })

@@ -15,7 +15,7 @@ use parquet::arrow::arrow_reader::{
 use rayon::prelude::*;
 
 use super::{
-    Column, DType, Defect, DefectKind, EpisodeEntry, FeatureDecl, Info, ReadLimits,
+    Column, DType, Defect, DefectKind, EpisodeEntry, FeatureDecl, Info, ReadLimits, declared,
     paths::{self, TemplateValues},
 };
 
@@ -63,12 +63,13 @@ pub(crate) fn guarded<T>(read: impl FnOnce() -> Result<T, String>) -> Result<T, 
 
 /// Opens a Parquet file and checks its footer against the file's size.
 pub(crate) fn open_parquet(path: &Path) -> Result<(File, ArrowReaderMetadata), String> {
-    let file = File::open(path).map_err(|e| e.to_string())?;
-    let size = file.metadata().map_err(|e| e.to_string())?;
-    if !size.is_file() {
+    // Opening a pipe waits for somebody to write into it.
+    if !fs::metadata(path).map_err(|e| e.to_string())?.is_file() {
         return Err("something that is not a regular file".to_owned());
     }
-    let size = size.len();
+    let file = File::open(path).map_err(|e| e.to_string())?;
+    let size = file.metadata().map_err(|e| e.to_string())?.len();
+    declared::check_schema(&file, size)?;
     let metadata =
         guarded(|| ArrowReaderMetadata::load(&file, ArrowReaderOptions::new()).map_err(|e| e.to_string()))?;
     let mut n_rows: i64 = 0;
@@ -95,6 +96,7 @@ pub(crate) fn open_parquet(path: &Path) -> Result<(File, ArrowReaderMetadata), S
             }
         }
     }
+    declared::check_rows(n_rows, size)?;
     if n_rows != metadata.metadata().file_metadata().num_rows() {
         let declared = metadata.metadata().file_metadata().num_rows();
         return Err(format!("a footer of {declared} rows whose row groups have {n_rows}"));
@@ -371,8 +373,9 @@ fn runs_of_file(
     let mut runs: Vec<(i64, u64)> = Vec::new();
     guarded(|| {
         let (handle, metadata) = open_parquet(&file.path)?;
+        let mask = ProjectionMask::columns(metadata.parquet_schema(), ["episode_index"]);
+        declared::check_pages(&handle, metadata.metadata(), 0..file.row_groups.len(), &mask)?;
         let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(handle, metadata);
-        let mask = ProjectionMask::columns(builder.parquet_schema(), ["episode_index"]);
         let reader =
             builder.with_projection(mask).with_batch_size(65_536).build().map_err(|e| e.to_string())?;
         for batch in reader {

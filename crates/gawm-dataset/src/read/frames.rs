@@ -19,7 +19,7 @@ use parquet::{
 };
 use rayon::prelude::*;
 
-use super::{DType, Dataset, Defect, DefectKind, Run, files, scan::Unit};
+use super::{DType, Dataset, Defect, DefectKind, Run, declared, files, scan::Unit};
 
 /// Frames per record batch: images are large.
 const BATCH_FRAMES: usize = 32;
@@ -163,10 +163,11 @@ impl Dataset {
         files::guarded(|| {
             let options = ArrowReaderOptions::new().with_page_index_policy(PageIndexPolicy::Optional);
             let metadata = ArrowReaderMetadata::load(&handle, options).map_err(|e| e.to_string())?;
-            let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(handle, metadata);
-            let root = builder.schema().index_of(camera).map_err(|e| e.to_string())?;
-            let mask = ProjectionMask::roots(builder.parquet_schema(), [root]);
+            let root = metadata.schema().index_of(camera).map_err(|e| e.to_string())?;
+            let mask = ProjectionMask::roots(metadata.parquet_schema(), [root]);
             let (groups, skipped) = groups_of(&file.row_groups, run.start, run.start + run.n_rows);
+            declared::check_pages(&handle, metadata.metadata(), groups.iter().copied(), &mask)?;
+            let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(handle, metadata);
             let mut selectors = Vec::new();
             let mut at = 0;
             for row in rows.iter().filter(|row| (**row as u64) < run.n_rows) {

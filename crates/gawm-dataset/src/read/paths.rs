@@ -53,7 +53,7 @@ pub(super) fn fill(template: &str, values: TemplateValues<'_>) -> Result<String,
 /// Joins a relative path from metadata to the folder if it stays inside.
 ///
 /// Symbolic links are followed only inside the folder, or into the `blobs` folder of a Hugging Face cache that the folder
-/// belongs to. A path that does not exist is joined unchanged.
+/// belongs to. A path that does not exist is joined unchanged; pipes and devices are refused.
 pub(crate) fn join_inside(root: &Path, relative: &str) -> Result<PathBuf, String> {
     let path = Path::new(relative);
     if path.components().any(|c| !matches!(c, Component::Normal(_) | Component::CurDir)) {
@@ -61,6 +61,10 @@ pub(crate) fn join_inside(root: &Path, relative: &str) -> Result<PathBuf, String
     }
     let joined = root.join(path);
     let Ok(real) = joined.canonicalize() else { return Ok(joined) };
+    // Opening a pipe waits for somebody to write into it.
+    if std::fs::metadata(&real).is_ok_and(|m| !m.is_file() && !m.is_dir()) {
+        return Err(format!("{relative:?}, which is neither a file nor a folder"));
+    }
     let real_root = root.canonicalize().map_err(|e| e.to_string())?;
     let blobs = real_root.parent().and_then(Path::parent).map(|repository| repository.join("blobs"));
     if real.starts_with(&real_root) || blobs.is_some_and(|blobs| real.starts_with(blobs)) {

@@ -8,7 +8,7 @@ use std::sync::{
 use arrow::array::RecordBatch;
 use parquet::arrow::{ProjectionMask, arrow_reader::ParquetRecordBatchReaderBuilder};
 
-use super::{Column, DType, Dataset, Defect, DefectKind, Run, files};
+use super::{Column, DType, Dataset, Defect, DefectKind, Run, declared, files};
 
 /// Rows per record batch of number columns.
 const BATCH_ROWS: usize = 8192;
@@ -248,14 +248,15 @@ impl Dataset {
         batch_rows: usize,
     ) -> Result<parquet::arrow::arrow_reader::ParquetRecordBatchReader, String> {
         let (file, metadata) = files::open_parquet(&self.files[unit.file].path)?;
-        let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(file, metadata);
-        let schema = builder.schema().clone();
+        let schema = metadata.schema().clone();
         let roots = columns.iter().filter_map(|name| schema.index_of(name).ok());
-        let mask = ProjectionMask::roots(builder.parquet_schema(), roots);
-        let builder = builder
+        let mask = ProjectionMask::roots(metadata.parquet_schema(), roots);
+        let groups = unit.row_groups.iter().copied();
+        let most_rows = declared::check_pages(&file, metadata.metadata(), groups, &mask)?;
+        let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(file, metadata)
             .with_projection(mask)
             .with_row_groups(unit.row_groups.clone())
-            .with_batch_size(batch_rows);
+            .with_batch_size(batch_rows.min(most_rows));
         builder.build().map_err(|e| e.to_string())
     }
 }

@@ -4,10 +4,15 @@ use std::{collections::BTreeMap, fmt::Write};
 
 use base64::Engine;
 use gawm_image::{Limits, decode_thumbnail, encode_jpeg};
+use gawm_schema::{Encoding, FeatureData, Kind, Role, Wrap};
 
-use super::{Material, chart, escape};
+use super::{
+    Material, chart, escape,
+    streams::{Timing, skew},
+};
 use crate::{
     read::FrameBytes,
+    stats::{ColumnTotals, DimTotals},
     validate::{Finding, Severity, rule},
 };
 
@@ -15,18 +20,18 @@ use crate::{
 const SHOWN_FINDINGS: usize = 5;
 /// Dims shown per column.
 const SHOWN_DIMS: usize = 64;
+/// Dims shown of all columns together.
+const SHOWN_DIMS_IN_ALL: usize = 400;
 /// Rows of the episode table.
 const SHOWN_EPISODES: usize = 1500;
 /// Frames of a contact sheet.
 const SHEET_FRAMES: usize = 8;
+/// Characters of a task in the episode table.
+const TASK_CHARS: usize = 80;
 /// Cameras with a contact sheet.
 const SHOWN_CAMERAS: usize = 8;
 /// Width of a frame on a contact sheet in pixels.
 const FRAME_WIDTH: usize = 192;
-/// Clips shown.
-const SHOWN_CLIPS: usize = 10;
-/// Rows shown on each side of a clip.
-const CLIP_MARGIN: usize = 30;
 
 pub(super) fn overview(material: &Material<'_>, page: &mut String) {
     let (report, dataset) = (&material.examination.report, material.dataset);
@@ -48,8 +53,8 @@ pub(super) fn overview(material: &Material<'_>, page: &mut String) {
         facts.push((robot.clone(), "robot"));
     }
     if let Some(lag) = material.examination.action_lag {
-        let unit = if lag.rows.abs() == 1 { "row" } else { "rows" };
-        facts.push((format!("{} {unit}", lag.rows), "from action to motion"));
+        let name = if lag.rows < 0 { "action comes after its motion" } else { "from action to motion" };
+        facts.push((counted(lag.rows.unsigned_abs(), "row"), name));
     }
     page.push_str("<ul class=\"facts\">");
     for (value, name) in facts {
@@ -77,8 +82,10 @@ pub(super) fn alerts(material: &Material<'_>, page: &mut String) {
     let counts = report.counts;
     write!(
         page,
-        "<section id=\"alerts\"><h2>Alerts</h2><p>{} errors, {} warnings, {} notes.</p>",
-        counts.error, counts.warning, counts.info
+        "<section id=\"alerts\"><h2>Alerts</h2><p>{}, {}, {}.</p>",
+        counted(counts.error, "error"),
+        counted(counts.warning, "warning"),
+        counted(counts.info, "note")
     )
     .ok();
     if counts.error + counts.warning == 0 {
@@ -88,7 +95,7 @@ pub(super) fn alerts(material: &Material<'_>, page: &mut String) {
         by_rule(&report.findings).into_iter().partition(|g| g[0].severity == Severity::Info);
     alerts.iter().for_each(|group| alert(material, group, page));
     if !notes.is_empty() {
-        write!(page, "<details><summary>{} notes</summary>", counts.info).ok();
+        write!(page, "<details><summary>{}</summary>", counted(counts.info, "note")).ok();
         notes.iter().for_each(|group| alert(material, group, page));
         page.push_str("</details>");
     }
@@ -100,9 +107,7 @@ fn alert(material: &Material<'_>, group: &[&Finding], page: &mut String) {
     let (level, title) = (first.severity.text(), rule(first.code).map_or("", |r| r.title));
     write!(page, "<div class=\"alert {level}\"><span class=\"level\">{level}</span> <span class=\"code\">{}</span> {}<ul>", first.code, escape(title)).ok();
     for finding in group.iter().take(SHOWN_FINDINGS) {
-        let message =
-            if material.options.is_shared { shared(&finding.message) } else { finding.message.clone() };
-        write!(page, "<li>{}{}</li>", escape(&place(finding)), escape(&message)).ok();
+        write!(page, "<li>{}{}</li>", escape(&place(finding)), escape(&said(material, finding))).ok();
     }
     if group.len() > SHOWN_FINDINGS {
         write!(page, "<li class=\"soft\">and {} more</li>", group.len() - SHOWN_FINDINGS).ok();
@@ -110,11 +115,45 @@ fn alert(material: &Material<'_>, group: &[&Finding], page: &mut String) {
     write!(page, "</ul><span class=\"soft\">To do: {}</span></div>", escape(first.hint)).ok();
 }
 
-/// Leaves names of sessions and absolute paths out of a message.
+/// Cuts a text after so many characters.
+fn clipped(text: &str, n_chars: usize) -> String {
+    match text.char_indices().nth(n_chars) {
+        Some((at, _)) => format!("{}...", &text[..at]),
+        None => text.to_owned(),
+    }
+}
+
+/// Returns a number with its noun.
+fn counted(n: u64, noun: &str) -> String {
+    format!("{n} {noun}{}", if n == 1 { "" } else { "s" })
+}
+
+/// Returns a finding's message as the page may show it.
+pub(super) fn said(material: &Material<'_>, finding: &Finding) -> String {
+    if material.options.is_shared { shared(&finding.message) } else { finding.message.clone() }
+}
+
+/// Leaves names of sessions, absolute paths, addresses and hosts out of a text.
 fn shared(message: &str) -> String {
     let hidden = |word: &str| {
-        let bare = word.trim_matches(|c: char| "\"',:;()".contains(c));
-        bare.starts_with('/') && bare.len() > 1 || bare.starts_with("\\\\") || bare.get(1..3) == Some(":\\")
+        let bare = word.trim_start_matches(|c: char| "\"'(<[".contains(c));
+        let starts = |part: &str| {
+            bare.starts_with(part)
+                || ["=", ":", ",", "\""].iter().any(|c| bare.contains(&format!("{c}{part}")))
+        };
+        let is_drive = bare
+            .as_bytes()
+            .windows(3)
+            .any(|w| w[0].is_ascii_alphabetic() && w[1] == b':' && b"\\/".contains(&w[2]));
+        let is_host = [".local", ".lan", ".internal", ".home"]
+            .iter()
+            .any(|end| bare.trim_end_matches(|c: char| "\"'),:;.>]".contains(c)).ends_with(end));
+        (starts("/") || starts("~/")) && bare.len() > 1
+            || bare.contains("\\\\")
+            || is_drive
+            || bare.contains("://")
+            || bare.contains('@')
+            || is_host
     };
     let words: Vec<&str> = message.split(' ').map(|w| if hidden(w) { "(path)" } else { w }).collect();
     let text = words.join(" ");
@@ -124,7 +163,7 @@ fn shared(message: &str) -> String {
     }
 }
 
-fn place(finding: &Finding) -> String {
+pub(super) fn place(finding: &Finding) -> String {
     let mut parts = Vec::new();
     parts.extend(finding.episode.map(|e| format!("episode {e}")));
     parts.extend(
@@ -137,164 +176,114 @@ fn place(finding: &Finding) -> String {
     if parts.is_empty() { String::new() } else { format!("{}: ", parts.join(", ")) }
 }
 
-/// Draws the signals of the worst findings that name a place.
-pub(super) fn worst_clips(material: &Material<'_>, page: &mut String) {
-    let dataset = material.dataset;
-    let mut seen: BTreeMap<(&str, Option<i64>), usize> = BTreeMap::new();
-    let is_clip = |f: &&Finding| {
-        f.severity >= Severity::Warning && f.rows.is_some() && f.episode.is_some() && f.dim.is_some()
-    };
-    let clips: Vec<&Finding> = material
-        .examination
-        .report
-        .findings
-        .iter()
-        .filter(is_clip)
-        .filter(|f| {
-            let n = seen.entry((f.code, f.episode)).or_default();
-            *n += 1;
-            *n == 1
-        })
-        .take(SHOWN_CLIPS)
-        .collect();
-    if clips.is_empty() {
-        return;
-    }
-    let mut columns: Vec<String> = clips.iter().filter_map(|f| f.feature.clone()).collect();
-    columns.sort();
-    columns.dedup();
-    let scanned = dataset.scan(&columns, |rows| {
-        let wanted = clips.iter().enumerate().filter(|(_, f)| f.episode == Some(rows.run.episode_index));
-        wanted
-            .filter_map(|(i, f)| clip_values(dataset, &rows, f).map(|values| (i, values)))
-            .collect::<Vec<_>>()
-    });
-    let Ok((found, _)) = scanned else { return };
-    let mut found: Vec<(usize, Clip)> = found.into_iter().flatten().collect();
-    found.sort_by_key(|(i, _)| *i);
-    if found.is_empty() {
-        return;
-    }
-    page.push_str("<section id=\"clips\"><h2>Worst clips</h2><div class=\"dims\">");
-    for (i, clip) in found {
-        let finding = clips[i];
-        let title = format!("{} {}", finding.code, place(finding).trim_end_matches(": "));
-        let drawing = chart::trace(&clip.values, &title, Some(clip.mark));
-        write!(
-            page,
-            "<div class=\"dim\"><b>{}</b><small>{}</small>{drawing}</div>",
-            escape(&title),
-            escape(&finding.message)
-        )
-        .ok();
-    }
-    page.push_str("</div></section>\n");
-}
-
-struct Clip {
-    values: Vec<f64>,
-    mark: (f64, f64),
-}
-
-fn clip_values(
-    dataset: &crate::read::Dataset,
-    rows: &crate::read::EpisodeRows,
-    finding: &Finding,
-) -> Option<Clip> {
-    let (feature, dim, [first, end]) = (finding.feature.as_ref()?, finding.dim.as_ref()?, finding.rows?);
-    let labels = crate::validate::dim_labels(dataset, feature);
-    let dim = labels.iter().position(|l| l.name == *dim).or_else(|| dim.parse().ok())?;
-    let values = rows.column(feature)?.dims().get(dim)?;
-    let (first, end) = (first as usize, (end as usize).min(values.len()));
-    let (from, to) = (first.saturating_sub(CLIP_MARGIN), (end + CLIP_MARGIN).min(values.len()));
-    let shown = values.get(from..to).filter(|v| v.len() > 1)?;
-    let share = |row: usize| (row - from) as f64 / (to - from) as f64;
-    let stride = shown.len().div_ceil(300);
-    Some(Clip {
-        values: shown.iter().step_by(stride).copied().collect(),
-        mark: (share(first), share(end.max(first))),
-    })
-}
-
-pub(super) fn streams(material: &Material<'_>, page: &mut String) {
-    let episodes = &material.examination.episodes;
-    let of = |f: fn(&crate::validate::EpisodeMeasures) -> f64| -> Vec<f64> {
-        let mut values: Vec<f64> = episodes.iter().map(f).filter(|v| v.is_finite()).collect();
-        values.sort_by(f64::total_cmp);
-        values
-    };
-    let at = |values: &[f64], q: f64| {
-        values.get(((values.len().max(1) - 1) as f64 * q) as usize).copied().unwrap_or(0.0)
-    };
-    let (rate, gap, jitter) = (of(|e| e.rate_hz), of(|e| e.longest_periods), of(|e| e.jitter_periods));
-    page.push_str("<section id=\"streams\"><h2>Clock and streams</h2>");
-    write!(
-        page,
-        "<p>Rows come at {:.3} Hz (median over episodes; lowest {:.3}, highest {:.3}). The longest step between rows is {:.2} periods, jitter {:.1} % of a period (95th percentile, worst episode).</p>",
-        at(&rate, 0.5), at(&rate, 0.0), at(&rate, 1.0), at(&gap, 1.0), 100.0 * at(&jitter, 1.0)
-    )
-    .ok();
-    let column = |name: &str| material.stats.columns.iter().find(|c| c.name == name);
-    if let Some(ages) = column("gawm.age_ms") {
-        page.push_str("<div class=\"scroll\"><table><thead><tr><th>stream</th><th>age p50, ms</th><th>p90</th><th>p99</th><th>max</th><th>stamp to log p50, ms</th></tr></thead><tbody>");
-        let arrivals = column("gawm.arrival_age_ms");
-        for (i, dim) in ages.dims.iter().enumerate() {
-            let s = dim.values.summary();
-            let offset = arrivals.and_then(|a| a.dims.get(i)).map_or(0.0, |a| s.q50 - a.values.summary().q50);
-            write!(page, "<tr><td>{}</td><td>{:.1}</td><td>{:.1}</td><td>{:.1}</td><td>{:.1}</td><td>{offset:.1}</td></tr>", escape(&dim.name), s.q50, s.q90, s.q99, s.max).ok();
-        }
-        page.push_str("</tbody></table></div>");
-    } else {
-        page.push_str("<p class=\"soft\">The dataset does not record the ages of samples.</p>");
-    }
-    match material.examination.action_lag {
-        Some(lag) => write!(
-            page,
-            "<p>The motion from row t to t+1 is explained best by the action of row t{}: it explains {:.0} % of what the state's own momentum does not.</p>",
-            match lag.rows { 0 => String::new(), n if n > 0 => format!("-{n}"), n => format!("+{}", -n) },
-            100.0 * lag.explained
-        ),
-        None => write!(page, "<p class=\"soft\">Actions and states cannot be compared dim by dim.</p>"),
-    }
-    .ok();
-    page.push_str("</section>\n");
-}
-
 pub(super) fn dims(material: &Material<'_>, page: &mut String) {
     page.push_str("<section id=\"dims\"><h2>Dims</h2>");
-    for column in
-        material.stats.columns.iter().filter(|c| {
-            c.name != "timestamp" && !c.name.starts_with("gawm.valid") && !c.name.contains("age_ms")
-        })
-    {
-        let encoding =
-            if column.name.starts_with("gawm.") { " <span class=\"soft\">encoded</span>" } else { "" };
-        write!(page, "<h3>{}{encoding}</h3><div class=\"dims\">", escape(&column.name)).ok();
-        for dim in column.dims.iter().take(SHOWN_DIMS) {
-            let s = dim.values.summary();
-            let motion = dim.motion.summary(material.stats.fps);
-            // "1" says that there is no unit.
-            let has_unit = !dim.unit.is_empty() && dim.unit != "1";
-            let unit = if has_unit { format!(" [{}]", dim.unit) } else { String::new() };
-            let missing = if s.n_missing > 0 { format!(", {} missing", s.n_missing) } else { String::new() };
-            let name = if dim.name.is_empty() { column.name.clone() } else { dim.name.clone() };
-            write!(
-                page,
-                "<div class=\"dim\"><b>{}</b>{}<small>mean {:.4}, std {:.4}, {:.4} to {:.4}{missing}; speed {:.3}/s, idle {:.0} %</small>{}{}</div>",
-                escape(&name),
-                escape(&unit),
-                s.mean, s.std, s.min, s.max, motion.mean_speed, 100.0 * motion.idle_share,
-                chart::histogram(dim.values.histogram.counts(), &format!("histogram of {name}")),
-                chart::trace(&dim.trace, &format!("{name} in the first episode"), None)
-            )
-            .ok();
-        }
+    let is_shown = |c: &&ColumnTotals| {
+        c.name != "timestamp" && !c.name.starts_with("gawm.valid") && !c.name.contains("age_ms")
+    };
+    let mut left = SHOWN_DIMS_IN_ALL;
+    for column in material.stats.columns.iter().filter(is_shown) {
+        // What the model sees follows from the raw values: it is there for who asks.
+        let is_encoded = column.name.starts_with("gawm.");
+        let (open, close) = if is_encoded {
+            let head = format!("<details><summary>{} (encoded)</summary>", escape(&column.name));
+            (head, "</details>")
+        } else {
+            (format!("<h3>{}</h3>", escape(&column.name)), "")
+        };
+        page.push_str(&open);
+        let labels = encodings(material, &column.name);
+        let label = |i: usize| labels.get(i).map_or("", String::as_str);
+        let is_constant = |d: &DimTotals| {
+            let s = d.values.summary();
+            s.count > 0 && s.min == s.max && s.n_missing == 0
+        };
+        let (constant, moving): (Vec<_>, Vec<_>) =
+            column.dims.iter().enumerate().partition(|(_, d)| is_constant(d));
+        page.push_str("<div class=\"dims\">");
+        let n_shown = moving.len().min(SHOWN_DIMS).min(left);
+        left -= n_shown;
+        moving.iter().take(n_shown).for_each(|(i, d)| dim(material, &column.name, d, label(*i), page));
         page.push_str("</div>");
-        if column.dims.len() > SHOWN_DIMS {
-            write!(page, "<p class=\"soft\">and {} more dims</p>", column.dims.len() - SHOWN_DIMS).ok();
+        if moving.len() > n_shown {
+            write!(page, "<p class=\"soft\">and {} more dims</p>", moving.len() - n_shown).ok();
         }
+        constants(&column.name, &constant, page);
+        page.push_str(close);
     }
     page.push_str("</section>\n");
+}
+
+/// Draws one dim: moments, histogram, trace.
+fn dim(material: &Material<'_>, column: &str, dim: &DimTotals, encoding: &str, page: &mut String) {
+    let s = dim.values.summary();
+    let motion = dim.motion.summary(material.stats.fps);
+    // "1" says that there is no unit.
+    let has_unit = !dim.unit.is_empty() && dim.unit != "1";
+    let unit = if has_unit { format!(" [{}]", escape(&dim.unit)) } else { String::new() };
+    let missing = if s.n_missing > 0 { format!(", {} missing", s.n_missing) } else { String::new() };
+    let name = if dim.name.is_empty() { column } else { &dim.name };
+    let encoding = if encoding.is_empty() { String::new() } else { format!("{encoding}; ") };
+    write!(
+        page,
+        "<div class=\"dim\"><b>{}</b>{unit}<small>{encoding}mean {:.4}, std {:.4}, {:.4} to {:.4}{missing}; speed {:.3}/s, idle {:.0} %</small>{}{}</div>",
+        escape(name),
+        s.mean, s.std, s.min, s.max, motion.mean_speed, 100.0 * motion.idle_share,
+        chart::histogram(dim.values.histogram.counts(), &format!("histogram of {name}")),
+        chart::trace(&dim.trace, &format!("{name} in the first episode"), None)
+    )
+    .ok();
+}
+
+/// Names the dims that never change, in one line.
+fn constants(column: &str, dims: &[(usize, &DimTotals)], page: &mut String) {
+    if dims.is_empty() {
+        return;
+    }
+    let name = |d: &DimTotals| if d.name.is_empty() { column.to_owned() } else { d.name.clone() };
+    let listed =
+        dims.iter().take(SHOWN_DIMS).map(|(_, d)| format!("{} = {}", name(d), d.values.summary().min));
+    let more = dims.len().saturating_sub(SHOWN_DIMS);
+    let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+    let listed: Vec<String> = listed.map(|text| escape(&text)).collect();
+    write!(page, "<p class=\"soft\">Never change: {}{more}.</p>", listed.join(", ")).ok();
+}
+
+/// Returns what each dim of a column of a gawm dataset is, and how it is encoded.
+fn encodings(material: &Material<'_>, column: &str) -> Vec<String> {
+    let features = material.dataset.schema.iter().flat_map(|schema| &schema.features);
+    let Some(feature) = features.into_iter().find(|f| f.name == column) else { return Vec::new() };
+    let FeatureData::Vector { parts, .. } = &feature.data else { return Vec::new() };
+    let encoding = |kind: Kind| match feature.role {
+        Role::State => Some(Encoding::of_state(kind)),
+        Role::Action => Some(Encoding::of_action(kind)),
+        _ => None,
+    };
+    let text = |kind: Kind| {
+        let name = match kind {
+            Kind::Linear => "linear",
+            Kind::Angle { wrap: Wrap::None } => "angle",
+            Kind::Angle { wrap: Wrap::Pi } => "angle in [-pi, pi)",
+            Kind::Angle { wrap: Wrap::TwoPi } => "angle in [0, 2 pi)",
+            Kind::Quaternion { .. } => "quaternion",
+            Kind::Rotvec => "rotation vector",
+            Kind::Euler { .. } => "Euler angle",
+            Kind::Matrix => "rotation matrix",
+            Kind::Gripper => "gripper",
+            Kind::Bool => "truth value",
+            Kind::Direction => "direction",
+            _ => return String::new(),
+        };
+        let encoding = encoding(kind).map_or("", |encoding| match encoding {
+            Encoding::Identity => ", kept as it is",
+            Encoding::SinCos => ", encoded as sine and cosine",
+            Encoding::Rotation6d => ", encoded as 6-D rotation",
+            Encoding::RotationVector => ", encoded as rotation vector",
+            _ => "",
+        });
+        format!("{name}{encoding}")
+    };
+    parts.iter().flat_map(|part| part.dims.iter().map(move |_| text(part.kind))).collect()
 }
 
 pub(super) fn episodes(material: &Material<'_>, page: &mut String) {
@@ -314,24 +303,25 @@ pub(super) fn episodes(material: &Material<'_>, page: &mut String) {
         "warnings",
         "idle %",
         "jitter %",
-        "longest step",
+        "longest step, periods",
         "success",
         "task",
     ];
     page.push_str("<section id=\"episodes\"><h2>Episodes</h2><div class=\"scroll\"><table class=\"sortable\"><thead><tr>");
     head.iter().for_each(|name| {
-        write!(page, "<th><button type=\"button\">{name}</button></th>").ok();
+        let class = if matches!(*name, "success" | "task") { " class=\"text\"" } else { "" };
+        write!(page, "<th{class}><button type=\"button\">{name}</button></th>").ok();
     });
     page.push_str("</tr></thead><tbody>");
     for e in material.examination.episodes.iter().take(SHOWN_EPISODES) {
         let (errors, warnings) = alerts.get(&e.episode).copied().unwrap_or_default();
         let entry = material.dataset.entry(e.episode);
         let success = entry.and_then(|x| x.extra_text("success")).unwrap_or_default();
-        let task: String =
-            entry.and_then(|x| x.tasks.first()).map_or(String::new(), |t| t.chars().take(60).collect());
+        let task = entry.and_then(|x| x.tasks.first()).map_or(String::new(), |t| clipped(t, TASK_CHARS));
+        let task = if material.options.is_shared { shared(&task) } else { task };
         write!(
             page,
-            "<tr><td>{}</td><td>{}</td><td>{:.1}</td><td>{errors}</td><td>{warnings}</td><td>{:.0}</td><td>{:.1}</td><td>{:.2}</td><td>{}</td><td>{}</td></tr>",
+            "<tr><td>{}</td><td>{}</td><td>{:.1}</td><td>{errors}</td><td>{warnings}</td><td>{:.0}</td><td>{:.1}</td><td>{:.2}</td><td class=\"text\">{}</td><td class=\"text\">{}</td></tr>",
             e.episode, e.rows, e.rows as f64 / material.stats.fps, 100.0 * e.idle_share, 100.0 * e.jitter_periods, e.longest_periods, escape(&success), escape(&task)
         )
         .ok();
@@ -348,7 +338,7 @@ pub(super) fn episodes(material: &Material<'_>, page: &mut String) {
     page.push_str("</section>\n");
 }
 
-pub(super) fn cameras(material: &Material<'_>, page: &mut String) {
+pub(super) fn cameras(material: &Material<'_>, timing: Option<&Timing>, page: &mut String) {
     let dataset = material.dataset;
     let cameras = dataset.image_columns();
     let videos: Vec<&str> = dataset
@@ -362,7 +352,9 @@ pub(super) fn cameras(material: &Material<'_>, page: &mut String) {
         return;
     }
     page.push_str("<section id=\"cameras\"><h2>Cameras</h2>");
-    skew(material, page);
+    if let Some(timing) = timing {
+        skew(material, timing, page);
+    }
     for camera in cameras.iter().take(SHOWN_CAMERAS) {
         write!(page, "<h3>{}</h3><div class=\"sheet\">", escape(camera)).ok();
         let n_runs = dataset.runs.len();
@@ -388,36 +380,8 @@ pub(super) fn cameras(material: &Material<'_>, page: &mut String) {
     page.push_str("</section>\n");
 }
 
-/// Says how far apart the cameras' samples are, from the ages of their streams.
-fn skew(material: &Material<'_>, page: &mut String) {
-    let Some(ages) = material.stats.columns.iter().find(|c| c.name == "gawm.age_ms") else { return };
-    let is_camera = |name: &str| {
-        let name = name.to_ascii_lowercase();
-        ["cam", "image", "rgb", "video"].iter().any(|word| name.contains(word))
-            || material
-                .dataset
-                .info
-                .features
-                .iter()
-                .any(|f| f.is_camera() && f.name.to_ascii_lowercase().ends_with(&name))
-    };
-    let cameras: Vec<_> = ages.dims.iter().filter(|d| is_camera(&d.name)).collect();
-    for (i, a) in cameras.iter().enumerate() {
-        for b in &cameras[i + 1..] {
-            let apart = (a.values.summary().q50 - b.values.summary().q50).abs();
-            write!(
-                page,
-                "<p>Samples of {} and {} are {apart:.1} ms apart in the median.</p>",
-                escape(&a.name),
-                escape(&b.name)
-            )
-            .ok();
-        }
-    }
-}
-
 /// Returns a frame as a small picture inside the page.
-fn embedded(frame: &FrameBytes) -> Option<String> {
+pub(super) fn embedded(frame: &FrameBytes) -> Option<String> {
     let FrameBytes::Encoded(bytes) = frame else { return None };
     let (_, picture) = decode_thumbnail(bytes, FRAME_WIDTH / 2, &Limits::default()).ok()?;
     let small = if picture.width > FRAME_WIDTH {
@@ -427,4 +391,22 @@ fn embedded(frame: &FrameBytes) -> Option<String> {
     };
     let jpeg = encode_jpeg(&small.to_image().ok()?, 75).ok()?;
     Some(format!("data:image/jpeg;base64,{}", base64::engine::general_purpose::STANDARD.encode(jpeg)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check_shared(text: &str, expected: &str) {
+        assert_eq!(shared(text), expected);
+    }
+
+    #[test]
+    fn paths_addresses_and_hosts_are_left_out() {
+        check_shared("meta/info.json: expected 3 / 4 episodes", "meta/info.json: expected 3 / 4 episodes");
+        check_shared("file \"/home/joe/a.mcap\", row 3", "file (path) row 3");
+        check_shared("from path=/data/x and C:\\logs and \\\\nas\\logs", "from (path) and (path) and (path)");
+        check_shared("s3://bucket/x of joe@lab.org on pc7.local.", "(path) of (path) on (path)");
+        check_shared("session \"monday of joe\" is on both sides", "a session is on both sides");
+    }
 }

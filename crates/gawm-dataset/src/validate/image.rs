@@ -250,10 +250,9 @@ impl Judge<'_> {
         let measures: Vec<Repeats> = self.runs.iter().map(|(run, camera)| repeats_of(run, camera)).collect();
         let longest: Vec<f64> = measures.iter().map(|m| m.frozen.n_rows as f64).collect();
         let usual_frozen = if longest.len() >= 3 { median(&longest) } else { 0.0 };
-        let n_frames: usize = self.runs.iter().map(|(_, c)| c.frames.len()).sum::<usize>().max(1);
-        let n_repeated: usize = measures.iter().map(|m| m.repeated.len()).sum();
+        let n_repeated: Vec<usize> = measures.iter().map(|m| m.repeated.len()).collect();
         let shortest = (self.thresholds.image.frozen_secs * self.fps).max(5.0);
-        for ((run, _), measure) in self.runs.iter().zip(&measures) {
+        for (i, ((run, _), measure)) in self.runs.iter().zip(&measures).enumerate() {
             let frozen = measure.frozen;
             let is_frozen =
                 frozen.n_rows as f64 >= shortest && frozen.n_rows as f64 > 3.0 * usual_frozen.min(shortest);
@@ -263,7 +262,7 @@ impl Judge<'_> {
                 findings.push(finding.measured(frozen.n_rows as f64, shortest));
             }
             // A camera slower than the rows repeats by nature.
-            let is_nature = n_repeated as f64 > 0.05 * n_frames as f64;
+            let is_nature = self.is_nature(&n_repeated, i, 0.05);
             let beside: Vec<usize> = measure
                 .repeated
                 .iter()
@@ -279,6 +278,16 @@ impl Judge<'_> {
                 );
             }
         }
+    }
+
+    /// Returns whether the other runs show this too: in more than `share` of their frames.
+    ///
+    /// With one or two runs all frames are asked, the run's own among them.
+    fn is_nature(&self, counts: &[usize], run: usize, share: f64) -> bool {
+        let asks = |i: &usize| self.runs.len() < 3 || *i != run;
+        let n: usize = (0..counts.len()).filter(asks).map(|i| counts[i]).sum();
+        let n_frames: usize = (0..counts.len()).filter(asks).map(|i| self.runs[i].1.frames.len()).sum();
+        n as f64 > share * n_frames.max(1) as f64
     }
 
     fn odd(&self, findings: &mut Vec<Finding>) {
@@ -299,14 +308,10 @@ impl Judge<'_> {
             }
             events.push((run, odd));
         }
-        let n: usize = events.iter().map(|e| e.1.len()).sum();
-        let n_frames: usize = self.runs.iter().map(|(_, c)| c.frames.len()).sum::<usize>().max(1);
-        // A flickering scene does it all the time.
-        if n as f64 > 0.01 * n_frames as f64 {
-            return;
-        }
-        for (run, odd) in events {
-            if let Some((row, size)) = odd.first() {
+        let n_odd: Vec<usize> = events.iter().map(|e| e.1.len()).collect();
+        for (i, (run, odd)) in events.into_iter().enumerate() {
+            // A flickering scene does it all the time.
+            if let Some((row, size)) = odd.first().filter(|_| !self.is_nature(&n_odd, i, 0.01)) {
                 let message = format!(
                     "{} frames differ from both neighbours, {size:.0} times more than these from each other",
                     odd.len()

@@ -9,6 +9,8 @@ use super::{
 
 /// Most candidates for jumps kept per dim and run.
 const MAX_JUMPS: usize = 12;
+/// The roughest hundredth of an episode is at most this many times its roughest tenth, unless single rows make it.
+const SPIKED: f64 = 10.0;
 /// A jump is this many times longer than the steps beside it.
 const ISOLATED: f64 = 2.5;
 /// Rows of a window for noise.
@@ -225,7 +227,9 @@ fn unsteadiness(steps: &[f64], signal: &mut Signal) {
     }
     signal.rough99 = quantile(&rough, 0.99);
     signal.rough50 = quantile(&rough, 0.5);
-    let floor = (4.0 * signal.rough99).max(0.01 * signal.range());
+    // Some spikes of a short episode are more than its roughest hundredth, and must not set their own bound.
+    let own = signal.rough99.min(SPIKED * quantile(&rough, 0.9));
+    let floor = (4.0 * own).max(0.01 * signal.range());
     for (t, size) in rough.iter().enumerate().filter(|(_, size)| **size > floor) {
         if !is_isolated(steps, t) {
             continue;
@@ -401,5 +405,14 @@ mod tests {
         let signal = measure(&values, DimKind::Unknown);
         assert!(signal.jumps.iter().any(|j| j.row == 100));
         assert_eq!(signal.zero_drops, [35]);
+    }
+
+    #[test]
+    fn spikes_of_a_short_episode_do_not_hide_themselves() {
+        let mut values = smooth(70);
+        values[20] = -999.0;
+        values[50] = -999.0;
+        let signal = measure(&values, DimKind::Unknown);
+        assert!([20, 50].iter().all(|row| signal.jumps.iter().any(|j| j.row == *row)), "{:?}", signal.jumps);
     }
 }

@@ -166,6 +166,21 @@ fn model_agent<'a>(
 }
 
 #[test]
+fn models_and_settings_that_do_not_fit_are_refused() {
+    let world = world();
+    let check_refused = |change: &dyn Fn(&mut crate::run::Run, &mut PlannerConfig), says: &str| {
+        let (mut run, mut config) = (crate::testing::run(3), PlannerConfig::small());
+        change(&mut run, &mut config);
+        let error = crate::suite::latent_agent(&world, &run, &config).err().map(|error| error.to_string());
+        assert!(error.as_ref().is_some_and(|error| error.contains(says)), "{says}: {error:?}");
+    };
+    check_refused(&|run, _| run.hello.action.dims[1].max = 40.0, "expected y from -1 to 1 as two-room has");
+    check_refused(&|run, _| drop(run.hello.action.dims.pop()), "1 action dims, expected 2");
+    check_refused(&|_, config| config.history = 4, "planner.history");
+    check_refused(&|_, config| config.deadline_ms = Some(0), "planner.deadline_ms");
+}
+
+#[test]
 fn planning_over_a_model_does_not_depend_on_threads_or_other_problems() {
     let (world, run) = (world(), crate::testing::run(3));
     let problems = draw(Filter::NonTrivial, 3, 7).problems;

@@ -183,6 +183,9 @@ impl PlannerConfig {
                 format!("{:?}", self.method).to_lowercase(),
             );
         }
+        if self.deadline_ms == Some(0) {
+            return refuse("deadline_ms", "at least 1", "0".to_owned());
+        }
         let numbers = [
             ("sigma", positive(self.sigma), "a positive number", self.sigma),
             ("sigma_floor", share(self.sigma_floor), "0 to below 1", self.sigma_floor),

@@ -73,22 +73,11 @@ impl LayerPass<'_> {
             false,
             &mut scratch.operands,
         );
-        self.linear(
-            KEY,
-            [tokens, w, w],
-            Matrix { values: y, stride: w },
-            sized(&mut state.k, tokens * w),
-            false,
-            &mut scratch.operands,
-        );
-        self.linear(
-            VALUE,
-            [tokens, w, w],
-            Matrix { values: y, stride: w },
-            sized(&mut state.v, tokens * w),
-            false,
-            &mut scratch.operands,
-        );
+        for (layer, output) in [(KEY, &mut state.k), (VALUE, &mut state.v)] {
+            let output = sized(output, tokens * w);
+            let input = Matrix { values: y, stride: w };
+            self.linear(layer, [tokens, w, w], input, output, false, &mut scratch.operands);
+        }
         self.attend(state, scratch);
 
         let x = &mut scratch.x[..tokens * w];

@@ -5,8 +5,6 @@ use std::path::Path;
 
 use arrow::array::{Array, AsArray};
 use arrow::datatypes::Int64Type as ArrowInt64;
-use parquet::arrow::ProjectionMask;
-use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use parquet::column::writer::ColumnCloseResult;
 use parquet::data_type::Int64Type;
 use parquet::errors::ParquetError;
@@ -18,6 +16,7 @@ use parquet::schema::types::ColumnPath;
 
 use crate::columns::numeric_properties;
 use crate::durable::{Disk, DiskFile};
+use crate::read::checked_builder;
 
 /// The column that is written anew.
 const COLUMN: &str = "task_index";
@@ -123,10 +122,9 @@ fn write_tasks(
 }
 
 fn read_tasks(source: &Path, group: usize) -> Result<Vec<i64>, ParquetError> {
-    let builder = ParquetRecordBatchReaderBuilder::try_new(File::open(source)?)?;
-    let mask = ProjectionMask::columns(builder.parquet_schema(), [COLUMN]);
+    let builder = checked_builder(source, |name| name == COLUMN)?;
     let mut tasks = Vec::new();
-    for batch in builder.with_projection(mask).with_row_groups(vec![group]).build()? {
+    for batch in builder.with_row_groups(vec![group]).build()? {
         let batch = batch?;
         let array = batch.column_by_name(COLUMN).and_then(|array| array.as_primitive_opt::<ArrowInt64>());
         let array = array.filter(|array| array.null_count() == 0);
