@@ -17,7 +17,7 @@ mod mp4;
 mod paths;
 mod scan;
 
-pub(crate) use declared::{check_pages, checked_builder};
+pub use declared::{check_pages, checked_builder};
 pub(crate) use episode_table::episode_statistics;
 pub(crate) use files::{guarded, open_parquet};
 pub(crate) use info::read_json;

@@ -262,7 +262,11 @@ pub(super) fn check_rows(n_rows: i64, size: u64) -> Result<(), String> {
 
 /// Checks the headers of all pages that a reader of these columns and row groups will read, and returns how many rows of
 /// them a batch may have at most: texts that share one long dictionary entry are long in each row.
-pub(crate) fn check_pages(
+///
+/// # Errors
+///
+/// The first page that declares more than its file can hold.
+pub fn check_pages(
     file: &File,
     metadata: &ParquetMetaData,
     row_groups: impl IntoIterator<Item = usize>,
@@ -283,7 +287,11 @@ pub(crate) fn check_pages(
 }
 
 /// Opens a reader of the columns that `wants` names, with everything checked that it will allocate by.
-pub(crate) fn checked_builder(
+///
+/// # Errors
+///
+/// The file cannot be opened, is no Parquet file, or declares more than it can hold.
+pub fn checked_builder(
     path: &Path,
     wants: impl Fn(&str) -> bool,
 ) -> Result<ParquetRecordBatchReaderBuilder<File>, ParquetError> {

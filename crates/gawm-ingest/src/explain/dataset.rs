@@ -1,14 +1,13 @@
 //! Finds a row of a dataset and where it comes from.
 
-use std::fs::File;
 use std::path::Path;
 
 use arrow::array::{Array, AsArray, RecordBatch};
 use arrow::datatypes::{Float32Type, Float64Type, Int64Type};
 use gawm_dataset::layout::{AGE_MS, ARRIVAL_AGE_MS, GAWM, TIME_NS, VALID, data_path};
+use gawm_dataset::read::checked_builder;
 use gawm_dataset::{GawmMeta, RecordingRecord};
 use gawm_schema::Feature;
-use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
 use super::ExplainError;
@@ -120,14 +119,11 @@ pub(crate) fn origin(
 
 fn read(path: &Path, feature: &Feature, take: &mut dyn FnMut(&RecordBatch)) -> Result<(), ExplainError> {
     let fail = |detail: String| ExplainError::Dataset { path: path.to_owned(), detail };
-    let file = File::open(path).map_err(|error| fail(error.to_string()))?;
-    let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(|error| fail(error.to_string()))?;
     let valid = format!("{VALID}{}", feature.name);
     let wanted = ["episode_index", "frame_index", TIME_NS, AGE_MS, ARRIVAL_AGE_MS, &feature.name, &valid];
-    let fields = builder.schema().fields();
-    let roots = (0..fields.len()).filter(|&at| wanted.contains(&fields[at].name().as_str()));
-    let mask = ProjectionMask::roots(builder.parquet_schema(), roots);
-    let reader = builder.with_projection(mask).build().map_err(|error| fail(error.to_string()))?;
+    let reader = checked_builder(path, |name| wanted.contains(&name))
+        .and_then(ParquetRecordBatchReaderBuilder::build)
+        .map_err(|error| fail(error.to_string()))?;
     for batch in reader {
         take(&batch.map_err(|error| fail(error.to_string()))?);
     }

@@ -6,13 +6,14 @@ use std::io;
 use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use arrow::array::RecordBatch;
 use bytes::Bytes;
-use gawm_dataset::read::{DType, Dataset, FeatureDecl, ReadLimits};
+use gawm_dataset::read::{DType, Dataset, FeatureDecl, ReadLimits, check_pages};
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use parquet::file::metadata::ParquetMetaData;
 
 use super::cells::{CellKind, NoMessage, push_cell, push_raw_image, raw_image_channel};
 use super::damage::damage_of;
@@ -45,6 +46,8 @@ pub struct LerobotRecording {
     selected: BTreeSet<String>,
     spans: Vec<Span>,
     blocks: Vec<BlockRef>,
+    /// How many rows a batch may have at most in files and row groups whose pages were checked.
+    checked: Mutex<BTreeMap<(usize, usize), usize>>,
 }
 
 /// The rows of one episode: of one run of the data.
@@ -95,6 +98,7 @@ impl LerobotRecording {
             selected: BTreeSet::new(),
             spans: Vec::new(),
             blocks: Vec::new(),
+            checked: Mutex::default(),
         };
         recording.find_columns()?;
         recording.find_episodes()?;
@@ -324,6 +328,24 @@ impl LerobotRecording {
         episode.start_ns.saturating_add((frame * 1e9 / self.dataset.info.fps).round() as i64)
     }
 
+    /// Checks once what the pages of the selected columns declare; returns how many rows a batch may have.
+    fn check_row_group(
+        &self,
+        file: usize,
+        row_group: usize,
+        metadata: &ParquetMetaData,
+        mask: &ProjectionMask,
+    ) -> Result<usize, String> {
+        let mut checked = self.checked.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(most_rows) = checked.get(&(file, row_group)) {
+            return Ok(*most_rows);
+        }
+        let opened = File::open(&self.dataset.files[file].path).map_err(|error| error.to_string())?;
+        let most_rows = check_pages(&opened, metadata, [row_group], mask)?;
+        checked.insert((file, row_group), most_rows);
+        Ok(most_rows)
+    }
+
     fn read_span(&self, span: &Span, out: &mut Block) -> Result<(), String> {
         let run = self.dataset.runs[self.episodes[span.episode].run];
         let file = &self.dataset.files[run.file];
@@ -337,6 +359,7 @@ impl LerobotRecording {
             .filter_map(|channel| Some((schema.index_of(&channel.topic).ok()?, channel)))
             .collect();
         let mask = ProjectionMask::roots(builder.parquet_schema(), columns.iter().map(|(index, _)| *index));
+        let most_rows = self.check_row_group(run.file, span.row_group, builder.metadata(), &mask)?;
         let n_rows = usize::try_from(span.rows.end - span.rows.start).map_err(|error| error.to_string())?;
         let offset = usize::try_from(span.offset).map_err(|error| error.to_string())?;
         let reader = builder
@@ -344,7 +367,7 @@ impl LerobotRecording {
             .with_row_groups(vec![span.row_group])
             .with_offset(offset)
             .with_limit(n_rows)
-            .with_batch_size(BATCH_ROWS.min(n_rows.max(1)))
+            .with_batch_size(BATCH_ROWS.min(n_rows.max(1)).min(most_rows))
             .build()
             .map_err(|error| error.to_string())?;
         let mut messages = Messages { recording: self, span, out, data: Vec::new(), nulls: BTreeMap::new() };
@@ -581,6 +604,7 @@ impl RowRecording for LerobotRecording {
 
     fn select(&mut self, topics: &[String]) {
         self.selected = topics.iter().cloned().collect();
+        self.checked = Mutex::default();
         self.list_blocks();
     }
 
