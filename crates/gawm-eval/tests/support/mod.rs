@@ -117,16 +117,20 @@ pub(crate) fn hello(data: &Path, size: usize) -> Outcome<Hello> {
         let all = meta["standardisation"].as_array().ok_or("no standardisation")?;
         let found = all.iter().find(|one| one["column"] == column).ok_or("no such column")?;
         let dims = found["dims"].as_array().ok_or("no dims")?;
+        // What TwoRoom has: actions from -1 to 1, positions in 224 pixels.
+        let (unit, low, high) = if name == "action" { ("\"1\"", -1.0, 1.0) } else { ("\"px\"", 0.0, 224.0) };
         let dim = |dim: &serde_json::Value| -> Outcome<StandardisedDimInfo> {
+            let mean = dim["mean"].as_f64().ok_or("no mean")?;
+            let scale = dim["scale"].as_f64().ok_or("no scale")?;
             Ok(StandardisedDimInfo {
                 name: dim["name"].as_str().ok_or("no name")?.to_owned(),
                 feature: name.to_owned(),
-                unit: serde_json::from_str(if name == "action" { "\"1\"" } else { "\"px\"" })?,
-                mean: dim["mean"].as_f64().ok_or("no mean")?,
-                scale: dim["scale"].as_f64().ok_or("no scale")?,
+                unit: serde_json::from_str(unit)?,
+                mean,
+                scale,
                 is_constant: false,
-                min: -3.0,
-                max: 3.0,
+                min: (low - mean) / scale,
+                max: (high - mean) / scale,
             })
         };
         Ok(EncodedFeature {
