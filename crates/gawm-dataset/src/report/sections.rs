@@ -404,7 +404,7 @@ mod tests {
     #[test]
     fn paths_addresses_and_hosts_are_left_out() {
         check_shared("meta/info.json: expected 3 / 4 episodes", "meta/info.json: expected 3 / 4 episodes");
-        check_shared("file \"/home/joe/a.mcap\", row 3", "file (path) row 3");
+        check_shared("file \"/mnt/joe/a.mcap\", row 3", "file (path) row 3");
         check_shared("from path=/data/x and C:\\logs and \\\\nas\\logs", "from (path) and (path) and (path)");
         check_shared("s3://bucket/x of joe@lab.org on pc7.local.", "(path) of (path) on (path)");
         check_shared("session \"monday of joe\" is on both sides", "a session is on both sides");
