@@ -181,7 +181,7 @@ fn is_camera(topic: &Topic, library: &SchemaLibrary) -> Option<Result<(u32, u32)
         let message = plan.extract(sample, &mut RowSink::new());
         match message.map_err(|error| error.to_string()).and_then(|message| {
             let keep = |data: &[u8]| bytes::Bytes::copy_from_slice(data);
-            Picture::new(&message, plan.kind(), keep).map_err(|error| error.to_string())
+            Picture::new(&message, keep).map_err(|error| error.to_string())
         }) {
             Ok(picture) if picture.packet().is_some() => return Some(video_size(topic, &plan)),
             Ok(picture) => return Some(Ok(picture.recorded_size())),
@@ -287,7 +287,7 @@ fn add_groups(
         stream.unit.clone_from(&group.unit);
         stream.limits.clone_from(&group.limits);
         stream.order = (group.kind == KindSpec::Quaternion).then(|| {
-            if group.fields.first().is_some_and(|field| field.ends_with(".w")) {
+            if group.fields.first().is_some_and(|field| field.ends_with(".w") || names::says_wxyz(field)) {
                 QuaternionOrder::Wxyz
             } else {
                 QuaternionOrder::Xyzw
