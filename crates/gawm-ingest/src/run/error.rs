@@ -128,7 +128,7 @@ pub enum RunError {
         age_ms: f64,
     },
     /// Nothing usable came of any input.
-    #[error("nothing was written: {}", gathered(.reasons))]
+    #[error("nothing was written:{}", gathered(.reasons))]
     Nothing {
         /// Why each input gave nothing.
         reasons: Vec<String>,
@@ -296,13 +296,13 @@ fn gathered(reasons: &[String]) -> String {
         let (what, hint) =
             reason.split_once("\nhint: ").map_or((reason.as_str(), None), |(what, hint)| (what, Some(hint)));
         if at < SHOWN {
-            text.push_str(if reasons.len() > 1 { "\n  " } else { "" });
+            text.push_str(if reasons.len() > 1 { "\n  " } else { " " });
             text.push_str(what);
         }
         hints.extend(hint.filter(|hint| !hints.contains(hint)));
     }
     if reasons.is_empty() {
-        text.push_str("none");
+        text.push_str(" none");
     }
     if reasons.len() > SHOWN {
         text.push_str(&format!("\n  and {} more", reasons.len() - SHOWN));
