@@ -556,7 +556,8 @@ fn set_rate(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Gues
         let colour = own.clone().filter(|stream| !is_depth(stream)).filter_map(rate_of).reduce(f64::min);
         colour.or(own.filter_map(rate_of).reduce(f64::min))
     };
-    let fastest = suggestion.contract.stream.iter().filter_map(rate_of).reduce(f64::max);
+    let is_measured = |stream: &&StreamSpec| stream.role != Some(RoleSpec::Annotation);
+    let fastest = suggestion.contract.stream.iter().filter(is_measured).filter_map(rate_of).reduce(f64::max);
     let (mut rate, mut reason) = match (slowest(RoleSpec::Image), slowest(RoleSpec::State)) {
         (Some(rate), _) => (rate, format!("the slowest camera has {rate:.3} Hz")),
         (None, Some(rate)) => (rate, format!("the slowest state stream has {rate:.3} Hz")),
