@@ -21,7 +21,7 @@ pub(crate) struct ExplainArgs {
     /// Number of the frame in the episode, from 0
     #[arg(value_name = "FRAME")]
     frame: u64,
-    /// Name of the value: joint_1, action[3], observation.state.joint_1, or an image feature
+    /// Name of the value: joint_1, action[3], observation.state.joint_1, joint_1.sin, gawm.state[3], or an image feature
     #[arg(value_name = "DIM")]
     dim: String,
     /// Files and folders in which the source logs are looked for, by their hash

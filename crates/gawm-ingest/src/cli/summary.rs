@@ -28,6 +28,16 @@ fn write(text: &mut String, outcome: &RunOutcome, out: &Path) -> std::fmt::Resul
     if summary.new_episodes != summary.episodes {
         writeln!(text, "  new: {} episodes, {} frames", summary.new_episodes, summary.new_frames)?;
     }
+    let already: Vec<&str> = report
+        .files
+        .iter()
+        .filter(|file| file.status == FileStatus::AlreadyThere)
+        .map(|file| file.path.as_str())
+        .collect();
+    if !already.is_empty() {
+        let more = if already.len() > 8 { ", ..." } else { "" };
+        writeln!(text, "  already there: {}{more}", already[..already.len().min(8)].join(", "))?;
+    }
     writeln!(text, "\ncolumns")?;
     for feature in &outcome.schema.features {
         let what = match &feature.data {
@@ -36,7 +46,8 @@ fn write(text: &mut String, outcome: &RunOutcome, out: &Path) -> std::fmt::Resul
                     parts.iter().flat_map(|part| &part.dims).map(|dim| dim.name.as_str()).collect();
                 let shown = names.iter().take(8).copied().collect::<Vec<_>>().join(", ");
                 let more = if names.len() > 8 { ", ..." } else { "" };
-                format!("{} values: {shown}{more}", names.len())
+                let noun = if names.len() == 1 { "value" } else { "values" };
+                format!("{} {noun}: {shown}{more}", names.len())
             }
             FeatureData::Image(spec) => {
                 format!("{}x{} {}", spec.width, spec.height, if spec.depth { "depth" } else { "image" })

@@ -555,6 +555,8 @@ impl Checker<'_> {
             let hint = "`gawm-ingest suggest LOG` proposes one from the measured delay of the robot";
             return Err(self.value(&format!("{key}.action"), expected, "nothing", hint));
         };
+        let refused =
+            |expected: &str, got: &str| Err(self.value(&format!("{key}.action.reduce"), expected, got, ""));
         match (spec.timing, spec.reduce, spec.n) {
             (ActionTimingSpec::InForce, None, None) => Ok(ActionTiming::InForce),
             (ActionTimingSpec::Next, None, None) => Ok(ActionTiming::Next),
@@ -563,15 +565,12 @@ impl Checker<'_> {
             }
             (ActionTimingSpec::Window, Some(reduce), None) => Ok(ActionTiming::Reduce(match reduce {
                 ReduceSpec::Last => Reduction::Last,
+                _ if kind == Kind::Bool => return refused("last for truth values", "another"),
                 ReduceSpec::Mean if kind.raw_width() > 1 => {
-                    let expected = "last or compose for rotations";
-                    return Err(self.value(&format!("{key}.action.reduce"), expected, "mean", ""));
+                    return refused("last or compose for rotations", "mean");
                 }
                 ReduceSpec::Mean => Reduction::Mean,
-                ReduceSpec::Sum if kind.raw_width() > 1 => {
-                    let expected = "compose for rotations";
-                    return Err(self.value(&format!("{key}.action.reduce"), expected, "sum", ""));
-                }
+                ReduceSpec::Sum if kind.raw_width() > 1 => return refused("compose for rotations", "sum"),
                 ReduceSpec::Sum => Reduction::Sum,
                 ReduceSpec::Compose => {
                     Reduction::Compose { in_body_frame: spec.delta_frame == super::DeltaFrame::Body }

@@ -21,7 +21,8 @@ pub struct ImagePlan {
     core: Core,
     /// Which part each slot is.
     parts: Vec<Part>,
-    kind: ImageKind,
+    /// `None` where each message tells by its members: channels without a schema.
+    kind: Option<ImageKind>,
     stamp: StampForm,
 }
 
@@ -39,6 +40,8 @@ pub enum ImageKind {
 /// One image message.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImageMessage<'a> {
+    /// Whether `data` is pixels or a file.
+    pub kind: ImageKind,
     /// Stamp in nanoseconds; absent if the message has none or 0.
     pub stamp_ns: Option<i64>,
     /// Coordinate frame; empty if not named.
@@ -60,6 +63,8 @@ pub struct ImageMessage<'a> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Part {
     FrameId,
+    /// Layout of pixels, beside which a message without a schema is no file.
+    Layout,
     Format,
     Width,
     Height,
@@ -72,6 +77,7 @@ impl ImageMessage<'_> {
     /// Copies what is borrowed.
     fn into_owned(self) -> ImageMessage<'static> {
         ImageMessage {
+            kind: self.kind,
             stamp_ns: self.stamp_ns,
             frame_id: Cow::Owned(self.frame_id.into_owned()),
             format: Cow::Owned(self.format.into_owned()),
@@ -104,10 +110,12 @@ impl ImagePlan {
         }
         let has = |path: &[&str]| has_path(&types.table, path);
         let is_open = types.encoding == Encoding::Json && types.table.root().fields.is_empty();
-        let named_raw = is_raw_name(channel.schema_name);
+        if is_open && !is_video {
+            return Self::open(channel, &types);
+        }
         let kind = if is_video {
             ImageKind::Video
-        } else if (has(&["width"]) && has(&["height"])) || (is_open && named_raw) {
+        } else if has(&["width"]) && has(&["height"]) {
             ImageKind::Raw
         } else {
             ImageKind::Compressed
@@ -131,14 +139,35 @@ impl ImagePlan {
         if kind == ImageKind::Raw && !fields.iter().any(|(part, _)| *part == Part::Format) {
             return Err(not_image("it names no pixel layout (field \"encoding\")".to_owned()));
         }
-        Self::build(channel, &types, kind, &fields)
+        let want = |part: &Part| if *part == Part::Data { Want::Bytes } else { Want::Scalars };
+        let fields: Vec<_> = fields.into_iter().map(|(part, path)| (part, path, want(&part))).collect();
+        Self::build(channel, &types, Some(kind), &fields)
+    }
+
+    /// Compiles a plan for messages without a schema: all that images have is looked for.
+    fn open(channel: &ChannelSchema<'_>, types: &Types) -> Result<Self, CompileError> {
+        let parts = [
+            (Part::Data, "data"),
+            (Part::Layout, "encoding"),
+            (Part::Format, "format"),
+            (Part::Width, "width"),
+            (Part::Height, "height"),
+            (Part::Step, "step"),
+            (Part::BigEndian, "is_bigendian"),
+            (Part::BigEndian, "is_big_endian"),
+        ];
+        let want = |part: &Part| if *part == Part::Data { Want::Bytes } else { Want::Optional };
+        let fields: Vec<_> =
+            parts.iter().map(|(part, name)| (*part, FieldPath::from_members([*name]), want(part))).collect();
+        Self::build(channel, types, None, &fields)
     }
 
     fn present(types: &Types, is_open: bool, wanted: &[(Part, Vec<&str>)]) -> Vec<(Part, FieldPath)> {
         // What a JSON schema leaves open may be in the messages all the same.
         let may_have = |part: &Part, path: &[&str]| match types.encoding {
             Encoding::Json if *part == Part::FrameId => false,
-            Encoding::Json if is_open => !matches!(part, Part::BigEndian),
+            // Only of videos: other images without a schema are told apart message by message.
+            Encoding::Json if is_open => true,
             _ => has_path(&types.table, path),
         };
         wanted
@@ -151,24 +180,22 @@ impl ImagePlan {
     fn build(
         channel: &ChannelSchema<'_>,
         types: &Types,
-        kind: ImageKind,
-        fields: &[(Part, FieldPath)],
+        kind: Option<ImageKind>,
+        fields: &[(Part, FieldPath, Want)],
     ) -> Result<Self, CompileError> {
-        let wants: Vec<(FieldPath, Want)> = fields
-            .iter()
-            .map(|(part, path)| (path.clone(), if *part == Part::Data { Want::Bytes } else { Want::Scalars }))
-            .collect();
+        let wants: Vec<(FieldPath, Want)> =
+            fields.iter().map(|(_, path, want)| (path.clone(), *want)).collect();
         let (core, slots, stamp) = Core::compile(channel, types, &wants, &StampSource::Auto)?;
         if slots.iter().any(|range| range.len() != 1) {
             let detail = "its fields are not those of an image".to_owned();
             return Err(CompileError::NotAnImage { topic: channel.topic.to_owned(), detail });
         }
-        let parts = fields.iter().map(|(part, _)| *part).collect();
+        let parts = fields.iter().map(|(part, ..)| *part).collect();
         Ok(Self { core, parts, kind, stamp })
     }
 
-    /// Tells whether messages hold pixels or a file.
-    pub fn kind(&self) -> ImageKind {
+    /// Tells whether messages hold pixels or a file; `None` where each message tells by itself.
+    pub fn kind(&self) -> Option<ImageKind> {
         self.kind
     }
 
@@ -197,6 +224,7 @@ impl ImagePlan {
         let mut emit = ExactRow::new(self.parts.len());
         self.core.run(payload, &mut sink.scratch, &mut emit)?;
         let mut image = ImageMessage {
+            kind: self.kind.unwrap_or(ImageKind::Compressed),
             stamp_ns: emit.stamp.finish(self.stamp),
             frame_id: Cow::Borrowed(""),
             format: Cow::Borrowed(""),
@@ -210,12 +238,18 @@ impl ImagePlan {
             let path = &self.core.requests.leaves[i].path;
             match (part, held) {
                 (Part::Data, Some(Held::Bytes(data))) => image.data = data,
+                (Part::Layout, Some(Held::Text(text))) => {
+                    (image.format, image.kind) = (text, ImageKind::Raw);
+                }
+                (Part::Format, Some(Held::Text(_)))
+                    if self.kind.is_none() && image.kind == ImageKind::Raw => {}
                 (Part::Format, Some(Held::Text(text))) => image.format = text,
                 (Part::FrameId, Some(Held::Text(text))) => image.frame_id = text,
                 (Part::Width, Some(Held::Number(n))) => image.width = size(n, path)?,
                 (Part::Height, Some(Held::Number(n))) => image.height = size(n, path)?,
                 (Part::Step, Some(Held::Number(n))) => image.step = size(n, path)?,
                 (Part::BigEndian, Some(Held::Number(n))) => image.is_big_endian = n.widen() != 0.0,
+                (_, None) if self.core.requests.leaves[i].is_optional => {}
                 (_, held) => {
                     let got = match held {
                         None => "nothing",
@@ -230,6 +264,10 @@ impl ImagePlan {
                     });
                 }
             }
+        }
+        if self.kind.is_none() && (image.width == 0 || image.height == 0) {
+            // A file may name its format in `encoding`.
+            image.kind = ImageKind::Compressed;
         }
         Ok(image)
     }
@@ -246,11 +284,6 @@ fn size(number: Number, path: &str) -> Result<u32, DecodeError> {
         expected: "a size in pixels or bytes",
         got: number.widen().to_string(),
     })
-}
-
-fn is_raw_name(schema_name: &str) -> bool {
-    let bare = schema_name.rsplit(['/', '.']).next().unwrap_or("");
-    matches!(bare, "Image" | "RawImage")
 }
 
 fn has_path(table: &TypeTable, path: &[&str]) -> bool {

@@ -54,5 +54,6 @@ pub use plan::{Column, DecodePlan, StampSource};
 pub(crate) use resolve::closest_first;
 pub use row::{Decoded, RowSink, Scalar, Value};
 pub use schema::ros_library::SchemaFolderError;
+pub(crate) use stamp::stamp_of_json;
 pub use stamp::{StampClass, StampUnit, classify_stamp};
 pub use to_json::{decode_to_json, decode_to_json_limited};

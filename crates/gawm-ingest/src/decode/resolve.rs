@@ -51,6 +51,8 @@ pub(crate) struct Leaf {
     /// Its path, in full.
     pub(crate) path: String,
     pub(crate) prim: Prim,
+    /// Whether a message may lack it.
+    pub(crate) is_optional: bool,
 }
 
 /// How an element of an array is picked.
@@ -84,6 +86,8 @@ pub(crate) enum Want {
     Scalars,
     /// A whole `uint8[]` or `bytes`, borrowed.
     Bytes,
+    /// As scalars, where a message has the member; only of messages without a schema.
+    Optional,
 }
 
 /// Resolves paths one after another; slots are given in order.
@@ -298,7 +302,7 @@ impl<'a> Resolver<'a> {
                 limit: MAX_WIDTH,
             });
         }
-        self.requests.leaves.push(Leaf { path: self.text(&walk.hops), prim });
+        self.requests.leaves.push(Leaf { path: self.text(&walk.hops), prim, is_optional: false });
         self.requests.all.push(Request { hops: walk.hops.clone(), target: Target::Slot(slot) });
         Ok(())
     }

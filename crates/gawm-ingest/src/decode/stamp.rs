@@ -1,5 +1,8 @@
 //! Stamps inside messages: when the sensor says the sample was taken.
 
+use serde_json::Value;
+
+use super::resolve::{NANOS, SECONDS};
 use super::row::Number;
 
 /// Wall-clock stamps lie between these two; others are simulated or since boot. 1990-01-01 and 2100-01-01.
@@ -77,6 +80,29 @@ impl Stamp {
             (_, text_ns) => text_ns,
         };
         stamp.filter(|ns| *ns != 0)
+    }
+}
+
+/// Returns the time that a value of a decoded message states: seconds and nanoseconds, a number of any unit, or a text.
+///
+/// A number that is no wall-clock time in any unit counts seconds, of a simulation for one.
+pub(crate) fn stamp_of_json(value: &Value) -> Option<i64> {
+    let number = |value: &Value| {
+        let whole = value.as_i64().map(Number::I64);
+        whole.or_else(|| value.as_f64().map(Number::F64))
+    };
+    match value {
+        Value::Number(_) => {
+            let number = number(value)?;
+            scaled(number, StampUnit::Auto).or_else(|| scaled(number, StampUnit::Seconds))
+        }
+        Value::String(text) => parse_iso8601(text),
+        Value::Object(parts) => {
+            let part = |names: &[&str]| names.iter().find_map(|name| integer(number(parts.get(*name)?)?));
+            let nanos = part(&NANOS).unwrap_or(0);
+            part(&SECONDS)?.checked_mul(NS_PER_S)?.checked_add(nanos)
+        }
+        _ => None,
     }
 }
 
@@ -218,6 +244,25 @@ mod tests {
         assert_eq!(stamp(Number::I64(0), StampUnit::Seconds), None);
         assert_eq!(stamp(Number::F64(f64::NAN), StampUnit::Seconds), None);
         assert_eq!(stamp(Number::I64(i64::MAX), StampUnit::Seconds), None);
+    }
+
+    #[test]
+    fn stamps_of_decoded_messages() {
+        let check = |text: &str, expected: Option<i64>| {
+            assert_eq!(stamp_of_json(&serde_json::from_str(text).unwrap()), expected, "{text}");
+        };
+        let ns = 1_750_000_000_250_000_000;
+        check("1750000000.25", Some(ns));
+        check("1750000000250", Some(ns));
+        check("1750000000250000000", Some(ns));
+        check("12.5", Some(12_500_000_000));
+        check("\"2025-06-15T15:06:40.25Z\"", Some(ns));
+        check(r#"{"sec": 1750000000, "nanosec": 250000000}"#, Some(ns));
+        check(r#"{"seconds": 3}"#, Some(3_000_000_000));
+        for nothing in ["null", "true", "{}", "[1]", "1e300", r#"{"sec": 9223372036854775807, "nanosec": 1}"#]
+        {
+            check(nothing, None);
+        }
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Task, success, operator, robot and session of episodes.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use regex::Regex;
@@ -8,7 +8,7 @@ use thiserror::Error;
 
 use super::SideFile;
 use super::value::{text_of, value_at};
-use crate::contract::{LabelSource, LabelsSpec};
+use crate::contract::{LabelSource, LabelsSpec, MetadataLabel, TopicLabel};
 
 /// Why labels cannot be read.
 #[derive(Debug, Error)]
@@ -29,6 +29,24 @@ pub enum LabelError {
         path: PathBuf,
         /// Why.
         detail: String,
+    },
+    /// A label comes from a side file, and none is named.
+    #[error("labels.{label}: expected labels.side_file, whose column {column:?} is meant, got none")]
+    NoSideFile {
+        /// The label.
+        label: &'static str,
+        /// The column.
+        column: String,
+    },
+    /// A label comes from a group that the path pattern lacks.
+    #[error("labels.{label}: labels.path_pattern has no group {group:?}, it has {present:?}")]
+    Group {
+        /// The label.
+        label: &'static str,
+        /// The group.
+        group: String,
+        /// The named groups that are there.
+        present: Vec<String>,
     },
     /// A column of the side file does not exist.
     #[error("labels.{label}: the side file has no column {column:?}, it has {present:?}")]
@@ -74,6 +92,8 @@ pub struct RecordingLabels {
     pub metadata: Vec<(String, BTreeMap<String, String>)>,
     /// Messages of label topics: (topic, field) to (time, text), in time order.
     values: BTreeMap<(String, String), Vec<(i64, String)>>,
+    /// Messages of label topics without the field.
+    without: BTreeMap<(String, String), u64>,
 }
 
 /// The episode that is asked about.
@@ -106,19 +126,52 @@ impl Labels {
         };
         let side_file = match &spec.side_file {
             None => None,
-            Some(path) => Some(SideFile::read(&folder.join(path), spec.side_key.as_deref())?),
+            Some(path) => {
+                let keys = (spec.side_key.as_deref(), spec.side_episode.as_deref());
+                Some(SideFile::read(&folder.join(path), keys)?)
+            }
         };
         let labels = Labels { spec: spec.clone(), pattern, side_file };
+        labels.check()?;
+        Ok(labels)
+    }
+
+    /// Refuses labels that no log can have.
+    fn check(&self) -> Result<(), LabelError> {
         for label in LABELS {
-            if let (Some(LabelSource::Column(column)), Some(file)) = (labels.source(label), &labels.side_file)
-                && let Some(first) = file.rows.first()
-                && !first.contains_key(&column.column)
-            {
-                let present = first.keys().cloned().collect();
-                return Err(LabelError::Column { label, column: column.column.clone(), present });
+            match self.source(label) {
+                Some(LabelSource::Capture(source)) => {
+                    let names = self.pattern.iter().flat_map(Regex::capture_names).flatten();
+                    let present: Vec<String> = names.map(str::to_owned).collect();
+                    if !present.contains(&source.capture) {
+                        return Err(LabelError::Group { label, group: source.capture.clone(), present });
+                    }
+                }
+                Some(LabelSource::Column(source)) => self.check_column(label, &source.column)?,
+                _ => {}
             }
         }
-        Ok(labels)
+        for (label, column) in [("side_key", &self.spec.side_key), ("side_episode", &self.spec.side_episode)]
+        {
+            if let Some(column) = column {
+                self.check_column(label, column)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn check_column(&self, label: &'static str, column: &str) -> Result<(), LabelError> {
+        let Some(file) = &self.side_file else {
+            return Err(LabelError::NoSideFile { label, column: column.to_owned() });
+        };
+        match file.rows.first() {
+            Some(first) if !first.contains_key(column) => Err(LabelError::Column {
+                label,
+                column: column.to_owned(),
+                present: first.keys().cloned().collect(),
+            }),
+            _ => Ok(()),
+        }
     }
 
     /// Returns the topics and fields that labels come from.
@@ -142,57 +195,67 @@ impl Labels {
         }
     }
 
-    /// Returns the labels of an episode.
-    pub(crate) fn of(&self, recording: &RecordingLabels, asked: Asked<'_>) -> EpisodeLabels {
-        let text = |label: &str| self.text(label, recording, asked).unwrap_or_default();
-        EpisodeLabels {
-            task: text("task"),
-            success: self.text("success", recording, asked).and_then(|text| self.truth(&text)),
-            operator: text("operator"),
-            robot: text("robot"),
-            session: text("session"),
+    /// Returns the labels of an episode, and why some are not known although the contract says where they come from.
+    pub(crate) fn of(
+        &self,
+        recording: &RecordingLabels,
+        asked: Asked<'_>,
+    ) -> (EpisodeLabels, BTreeSet<String>) {
+        let mut reasons = BTreeSet::new();
+        let mut text = |label: &'static str| match self.text(label, recording, asked) {
+            Ok(text) => text.unwrap_or_default(),
+            Err(reason) => {
+                reasons.insert(reason);
+                String::new()
+            }
+        };
+        let (task, said) = (text("task"), text("success"));
+        let (operator, robot, session) = (text("operator"), text("robot"), text("session"));
+        let success = self.truth(&said);
+        if success.is_none() && !said.trim().is_empty() {
+            reasons.insert(format!(
+                "labels.success: {said:?} is not known to be true or false; labels.success_values can say it"
+            ));
+        }
+        (EpisodeLabels { task, success, operator, robot, session }, reasons)
+    }
+
+    /// Returns what is said; nothing where the source says nothing, an error where the source is not there.
+    fn text(
+        &self,
+        label: &'static str,
+        recording: &RecordingLabels,
+        asked: Asked<'_>,
+    ) -> Result<Option<String>, String> {
+        match self.source(label) {
+            None => {
+                let mut names = self.pattern.iter().flat_map(Regex::capture_names).flatten();
+                if names.any(|name| name == label) { self.capture(label, &recording.path) } else { Ok(None) }
+            }
+            Some(LabelSource::Constant(text)) => Ok(Some(text.clone())),
+            Some(LabelSource::Flag(flag)) => Ok(Some(flag.to_string())),
+            Some(LabelSource::Capture(source)) => self.capture(&source.capture, &recording.path),
+            Some(LabelSource::Column(source)) => {
+                let Some(file) = &self.side_file else { return Ok(None) };
+                let row = file.find(&recording.path, asked.number).ok_or_else(|| {
+                    let name = recording.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+                    let episode =
+                        self.spec.side_episode.as_ref().map(|_| format!(", episode {}", asked.number));
+                    format!("labels.side_file has no row of {name:?}{}", episode.unwrap_or_default())
+                })?;
+                Ok(row.get(&source.column).cloned())
+            }
+            Some(LabelSource::Metadata(source)) => recording.in_metadata(label, source, asked.record),
+            Some(LabelSource::Topic(source)) => recording.in_topic(label, source, asked),
         }
     }
 
-    fn text(&self, label: &str, recording: &RecordingLabels, asked: Asked<'_>) -> Option<String> {
-        let capture = |name: &str| {
-            let path = recording.path.to_string_lossy().into_owned();
-            let found = self.pattern.as_ref()?.captures(&path)?.name(name)?.as_str().to_owned();
-            Some(found)
-        };
-        let Some(source) = self.source(label) else { return capture(label) };
-        match source {
-            LabelSource::Constant(text) => Some(text.clone()),
-            LabelSource::Flag(flag) => Some(flag.to_string()),
-            LabelSource::Capture(source) => capture(&source.capture),
-            LabelSource::Column(source) => {
-                let episode = self.spec.side_episode.as_deref().map(|column| (column, asked.number));
-                let row =
-                    self.side_file.as_ref()?.find(&recording.path, self.spec.side_key.as_deref(), episode)?;
-                row.get(&source.column).cloned()
-            }
-            LabelSource::Metadata(source) => {
-                let own = asked.record.filter(|(name, _)| *name == source.metadata);
-                let any = recording
-                    .metadata
-                    .iter()
-                    .find(|(name, values)| *name == source.metadata && values.contains_key(&source.key));
-                own.or(any)?.1.get(&source.key).cloned()
-            }
-            LabelSource::Topic(source) => {
-                let key = (source.topic.clone(), source.field.clone());
-                let values = recording.values.get(&key)?;
-                let mut within = values.iter().filter(|(ns, _)| *ns > asked.start_ns && *ns <= asked.end_ns);
-                let found = if label == "success" {
-                    within.next_back()
-                } else {
-                    let before = values.iter().rev().find(|(ns, _)| *ns <= asked.start_ns);
-                    before
-                        .filter(|(_, text)| !text.is_empty())
-                        .or(within.into_iter().find(|(_, t)| !t.is_empty()))
-                };
-                found.map(|(_, text)| text.clone())
-            }
+    fn capture(&self, name: &str, path: &Path) -> Result<Option<String>, String> {
+        let path = path.to_string_lossy();
+        let Some(pattern) = &self.pattern else { return Ok(None) };
+        match pattern.captures(&path) {
+            None => Err(format!("labels.path_pattern does not match the path {path:?}")),
+            Some(found) => Ok(found.name(name).map(|text| text.as_str().to_owned())),
         }
     }
 
@@ -213,7 +276,7 @@ impl Labels {
 impl RecordingLabels {
     /// Returns the labels of a recording of which no message has been read.
     pub fn new(path: PathBuf, metadata: Vec<(String, BTreeMap<String, String>)>) -> Self {
-        Self { path, metadata, values: BTreeMap::new() }
+        Self { path, metadata, ..Self::default() }
     }
 
     /// Takes a message of a label topic.
@@ -225,11 +288,56 @@ impl RecordingLabels {
         message: &serde_json::Value,
     ) {
         for (_, field) in fields.iter().filter(|(name, _)| name == topic) {
+            let key = (topic.to_owned(), field.clone());
             if let Some(value) = value_at(message, field) {
-                let values = self.values.entry((topic.to_owned(), field.clone())).or_default();
+                let values = self.values.entry(key).or_default();
                 let at = values.partition_point(|(ns, _)| *ns <= time_ns);
                 values.insert(at, (time_ns, text_of(&value)));
+            } else {
+                *self.without.entry(key).or_default() += 1;
             }
         }
+    }
+
+    fn in_metadata(
+        &self,
+        label: &str,
+        source: &MetadataLabel,
+        own: Option<&(String, BTreeMap<String, String>)>,
+    ) -> Result<Option<String>, String> {
+        let MetadataLabel { metadata: name, key } = source;
+        let mut named = own.into_iter().chain(&self.metadata).filter(|(other, _)| other == name).peekable();
+        let Some((_, first)) = named.peek().copied() else {
+            let names: BTreeSet<&String> = self.metadata.iter().map(|(name, _)| name).collect();
+            return Err(format!("labels.{label}: there is no metadata record {name:?}, there are {names:?}"));
+        };
+        let value = named.find_map(|(_, values)| values.get(key));
+        value.cloned().map(Some).ok_or_else(|| {
+            let keys: Vec<&String> = first.keys().collect();
+            format!("labels.{label}: metadata record {name:?} has no key {key:?}, it has {keys:?}")
+        })
+    }
+
+    fn in_topic(&self, label: &str, source: &TopicLabel, asked: Asked<'_>) -> Result<Option<String>, String> {
+        let key = (source.topic.clone(), source.field.clone());
+        let TopicLabel { topic, field } = source;
+        let Some(values) = self.values.get(&key) else {
+            return Err(match self.without.get(&key) {
+                None => format!("labels.{label}: no message of {topic} by the end of the episode"),
+                Some(n) => format!("labels.{label}: {n} messages of {topic}, none with {field:?}"),
+            });
+        };
+        let mut within = values.iter().filter(|(ns, _)| *ns > asked.start_ns && *ns <= asked.end_ns);
+        let found = if label == "success" {
+            within.next_back()
+        } else {
+            let before = values.iter().rev().find(|(ns, _)| *ns <= asked.start_ns);
+            before
+                .filter(|(_, text)| !text.is_empty())
+                .or(within.into_iter().find(|(_, text)| !text.is_empty()))
+        };
+        let at = if label == "success" { "within the episode" } else { "at its start or within it" };
+        let absent = || format!("labels.{label}: no message of {topic} {at}");
+        found.map(|(_, text)| Some(text.clone())).ok_or_else(absent)
     }
 }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use arrow::array::{Array, AsArray, RecordBatch};
 use arrow::datatypes::{Float32Type, Float64Type, Int64Type};
-use gawm_dataset::layout::{AGE_MS, ARRIVAL_AGE_MS, GAWM, TIME_NS, VALID, data_path};
+use gawm_dataset::layout::{AGE_MS, ARRIVAL_AGE_MS, GAWM, TIME_NS, VALID, data_path, encoded_path};
 use gawm_dataset::read::checked_builder;
 use gawm_dataset::{GawmMeta, RecordingRecord};
 use gawm_schema::Feature;
@@ -15,8 +15,9 @@ use super::ExplainError;
 /// Where a value stands and what is known of it.
 pub(crate) struct RowOrigin {
     pub(crate) recording: RecordingRecord,
-    /// Data file, relative to the dataset.
+    /// Data file, relative to the dataset, and its number.
     pub(crate) file: String,
+    pub(crate) file_number: u64,
     /// Row within the file.
     pub(crate) row: u64,
     pub(crate) time_ns: i64,
@@ -90,11 +91,13 @@ pub(crate) fn origin(
                     length += 1;
                     let number = u64::try_from(frame.value(at)).unwrap_or_default();
                     if number == wanted_frame {
-                        let file = data_path(file.number).display().to_string();
+                        let file_number = file.number;
+                        let file = data_path(file_number).display().to_string();
                         let (value, image_bytes) = value_of(batch, feature, index, at);
                         found = Some(RowOrigin {
                             recording: recording.clone(),
                             file,
+                            file_number,
                             row,
                             time_ns: time.value(at),
                             next_ns: None,
@@ -128,6 +131,39 @@ fn read(path: &Path, feature: &Feature, take: &mut dyn FnMut(&RecordBatch)) -> R
         take(&batch.map_err(|error| fail(error.to_string()))?);
     }
     Ok(())
+}
+
+/// The values of an encoded column in a row.
+#[derive(Debug, Default)]
+pub(crate) struct EncodedRow {
+    /// As in `data/`.
+    pub(crate) plain: Vec<f64>,
+    /// As in `gawm/encoded/`; empty where that was deleted.
+    pub(crate) standardised: Vec<f64>,
+}
+
+/// Reads an encoded column in the row of a frame; `number` is that of the data file.
+pub(crate) fn encoded(dir: &Path, number: u64, column: &str, (episode, frame): (u64, u64)) -> EncodedRow {
+    let row = |path: std::path::PathBuf| {
+        let wanted = ["episode_index", "frame_index", column];
+        let reader = checked_builder(&path, |name| wanted.contains(&name))
+            .and_then(ParquetRecordBatchReaderBuilder::build)
+            .ok()?;
+        reader.map_while(Result::ok).find_map(|batch| {
+            let position = |name: &str| {
+                batch.column_by_name(name).and_then(|column| column.as_primitive_opt::<Int64Type>().cloned())
+            };
+            let (episodes, frames) = (position("episode_index")?, position("frame_index")?);
+            let is_wanted = |at: &usize| {
+                u64::try_from(episodes.value(*at)) == Ok(episode)
+                    && u64::try_from(frames.value(*at)) == Ok(frame)
+            };
+            let at = (0..batch.num_rows()).find(is_wanted)?;
+            Some(numbers(batch.column_by_name(column)?.as_ref(), at))
+        })
+    };
+    let plain = row(dir.join(data_path(number))).unwrap_or_default();
+    EncodedRow { plain, standardised: row(dir.join(encoded_path(number))).unwrap_or_default() }
 }
 
 fn value_of(

@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use gawm_dataset::RecordingRecord;
+use gawm_schema::Role;
 
 use super::ExplainError;
 use super::dataset::RowOrigin;
@@ -11,7 +12,7 @@ use crate::align::{ActionTiming, Method};
 use crate::contract::{AlignSpec, CheckedContract, Clock, StreamData};
 use crate::decode::SchemaLibrary;
 use crate::log::discover;
-use crate::run::{Binding, BoundStream, OpenRecording, Plans, Source};
+use crate::run::{Binding, BoundStream, OpenRecording, Plans, Source, defect_of};
 
 /// Ages are stored in ms as 32-bit floats: a sample is recognised within this of where its age says.
 const AGE_SLACK_NS: i64 = 50_000;
@@ -215,4 +216,39 @@ pub(crate) fn describe(
         )?;
     }
     Ok(())
+}
+
+/// Writes how far the tick lies between two samples, and why a value is not valid.
+pub(crate) fn arithmetic(
+    text: &mut String,
+    stream: &BoundStream,
+    found: &[Found],
+    origin: &RowOrigin,
+) -> std::fmt::Result {
+    let rule = &stream.rule;
+    let used: Vec<&Found> = found.iter().filter(|message| message.is_used).collect();
+    if let (AlignSpec::Linear | AlignSpec::Slerp, [first, second]) = (rule.align, used.as_slice()) {
+        let (part, whole) = (origin.time_ns - first.time_ns, second.time_ns - first.time_ns);
+        let share = part as f64 / whole as f64;
+        writeln!(text, "  share: {part} ns of {whole} ns between them = {share:.6}")?;
+    }
+    if origin.is_valid {
+        return Ok(());
+    }
+    let defect = used.iter().find_map(|message| match &rule.data {
+        StreamData::Vector(vector) => {
+            let mut values: Vec<f64> = message.values.iter().map(|&value| vector.unit.apply(value)).collect();
+            defect_of(&mut values, vector.kind, (is_encoded(rule.role), true))
+        }
+        _ => None,
+    });
+    match (defect, used.is_empty()) {
+        (Some(defect), _) => writeln!(text, "  not valid: the message holds {defect}"),
+        (None, true) => writeln!(text, "  not valid: no message is near enough to be used"),
+        (None, false) => Ok(()),
+    }
+}
+
+fn is_encoded(role: Role) -> bool {
+    matches!(role, Role::State | Role::Action)
 }

@@ -2,6 +2,7 @@
 
 mod dataset;
 mod describe;
+mod encoded;
 mod messages;
 
 use std::fmt::Write as _;
@@ -111,7 +112,8 @@ pub struct Question<'a> {
     pub episode: u64,
     /// Number of the frame in it.
     pub frame: u64,
-    /// Name of the value (`joint_1`), `feature[3]`, `feature.name`, or the name of an image feature.
+    /// Name of the value (`joint_1`), `feature[3]`, `feature.name`, `gawm.state[3]`, the name of an encoded value
+    /// (`joint_1.sin`), or of an image feature.
     pub dim: &'a str,
     /// Files and folders in which the sources are looked for, by their hash.
     pub logs: &'a [PathBuf],
@@ -146,11 +148,18 @@ impl Target<'_> {
 /// The dataset or a source cannot be read, or the question names something that is not there.
 pub fn explain(question: &Question<'_>) -> Result<String, ExplainError> {
     let meta = dataset::meta(question.dir)?;
-    let target = target(&meta.schema.features, question.dim)?;
+    let asked = encoded::asked(&meta, question.dim);
+    let target = match &asked {
+        Some(asked) => asked.target()?,
+        None => target(&meta, question.dim)?,
+    };
     let place = Place { dir: question.dir, meta: &meta, episode: question.episode };
     let origin = place.origin(question.frame, &target)?;
     let mut text = String::new();
     // Writing to a text cannot fail.
+    if let Some(asked) = &asked {
+        asked.head(&mut text, question, &origin).ok();
+    }
     head(&mut text, question, &target, &origin).ok();
     let contract_text = meta.contracts.iter().find(|contract| contract.hash == origin.recording.contract);
     let contract_text = contract_text.map(|contract| contract.text.as_str()).unwrap_or_default();
@@ -172,10 +181,19 @@ pub fn explain(question: &Question<'_>) -> Result<String, ExplainError> {
             let origin = place.origin(before, &target)?;
             explainer.value(&mut text, &target, &origin, before)?;
         }
-        None => explainer.value(&mut text, &target, &origin, question.frame)?,
+        None => {
+            explainer.value(&mut text, &target, &origin, question.frame)?;
+            for other in asked.iter().flat_map(encoded::Asked::others) {
+                let origin = place.origin(question.frame, &other)?;
+                head(&mut text, question, &other, &origin).ok();
+                explainer.value(&mut text, &other, &origin, question.frame)?;
+            }
+        }
     }
-    encoding(&mut text, &meta, &target);
-    if log.is_none() {
+    encoded::describe(&mut text, question, &meta, &target, &origin).ok();
+    if log.is_none() && !question.logs.is_empty() {
+        text.push_str("\nnone of the files given with --log is the source (of the same name or not, its hash decides)\n");
+    } else if log.is_none() {
         text.push_str("\nthe raw messages are shown when the source files are given: --log FILE...\n");
     }
     Ok(text)
@@ -321,6 +339,7 @@ impl Explainer<'_> {
         ages(text, origin, stream).ok();
         let used = messages::around(&log.open, &log.binding, stream, self.contract, origin, &log.library);
         messages::describe(text, bound, &columns, &used).ok();
+        messages::arithmetic(text, bound, &used, origin).ok();
     }
 }
 
@@ -345,7 +364,8 @@ fn source_columns(feature: &Feature, derivation: Derivation, index: usize) -> Ra
     0..0
 }
 
-fn target<'a>(features: &'a [Feature], name: &str) -> Result<Target<'a>, ExplainError> {
+fn target<'a>(meta: &'a gawm_dataset::GawmMeta, name: &str) -> Result<Target<'a>, ExplainError> {
+    let features = &meta.schema.features;
     let mut known = Vec::new();
     let mut by_name = Vec::new();
     for feature in features {
@@ -375,6 +395,7 @@ fn target<'a>(features: &'a [Feature], name: &str) -> Result<Target<'a>, Explain
             Err(ExplainError::Ambiguous { dim: name.to_owned(), choices: features.collect() })
         }
         (None, _) => {
+            known.extend(encoded::names(meta));
             closest_first(&mut known, name);
             Err(ExplainError::Dim { dim: name.to_owned(), known })
         }
@@ -437,40 +458,4 @@ fn ages(text: &mut String, origin: &RowOrigin, stream: usize) -> std::fmt::Resul
         shown(&origin.age_ms),
         shown(&origin.arrival_age_ms)
     )
-}
-
-fn encoding(text: &mut String, meta: &gawm_dataset::GawmMeta, target: &Target<'_>) {
-    let FeatureData::Vector { parts, .. } = &target.feature.data else { return };
-    let Some(dim) = parts.iter().flat_map(|part| &part.dims).nth(target.index.unwrap_or_default()) else {
-        return;
-    };
-    let kind =
-        parts.iter().find(|part| part.dims.iter().any(|other| other.name == dim.name)).map(|part| part.kind);
-    writeln!(text, "  kind: {}", kind.map(describe::kind).unwrap_or_default()).ok();
-    for (column, dims) in &meta.encodings {
-        for (position, encoded) in dims.iter().enumerate() {
-            if encoded.feature != target.feature.name || !encoded.raw_dims.contains(&dim.name) {
-                continue;
-            }
-            let standard = meta.standardisation.iter().find(|fit| fit.column == *column);
-            let fit = standard.and_then(|fit| fit.dims.get(position));
-            let standardised = match fit {
-                Some(fit) if fit.is_standardised && fit.is_constant => {
-                    "constant in the training data: scale 1".to_owned()
-                }
-                Some(fit) if fit.is_standardised => {
-                    format!("standardised as (x - {:?}) / {:?}", fit.mean, fit.scale)
-                }
-                _ => "not standardised".to_owned(),
-            };
-            writeln!(
-                text,
-                "  encoding: {column}[{position}] {:?} ({} of {}), {standardised}",
-                encoded.name,
-                describe::encoding(encoded.encoding),
-                encoded.raw_dims.join(", ")
-            )
-            .ok();
-        }
-    }
 }

@@ -3,12 +3,18 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use super::OpenOptions;
 use super::error::OpenLogError;
+use super::open::limits;
 use super::refusal::Foreign;
 use super::rosbag2::{METADATA_FILE, Rosbag2Metadata};
+use super::source::Source;
+use super::summary::{read_summary, read_tail};
 
 /// Folders below a named folder that are searched.
 const MAX_DEPTH: usize = 16;
+/// Parts of a recording without metadata follow on each other within this time.
+const MAX_PART_GAP_NS: u64 = 2_000_000_000;
 
 /// One recording: a file, or the ordered parts of a split bag.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -50,8 +56,9 @@ impl Seen {
 /// Finds the recordings at the named files and folders.
 ///
 /// A folder with a rosbag2 `metadata.yaml`, and a LeRobot folder, is one recording. In other folders, files named `x_0.mcap`, `x_1.mcap`, … without
-/// a hole are the parts of one recording, and every other `.mcap`, `.h5`, `.hdf5` or `.npz` file is one of its own; folders
-/// below are searched too.
+/// a hole are the parts of one recording where each goes on within two seconds of where the one before ends (or has no
+/// summary that says when it ends), and every other `.mcap`, `.h5`, `.hdf5` or `.npz` file is one of its own; folders below
+/// are searched too.
 /// Named files are recordings of their own, except when all parts that a `metadata.yaml` beside them lists are named.
 /// A file that is named twice counts once.
 pub fn discover(inputs: &[PathBuf]) -> Discovery {
@@ -192,7 +199,7 @@ fn grouped(files: &[PathBuf]) -> Vec<(String, Vec<PathBuf>)> {
     }
     for (stem, parts) in numbered {
         let is_whole = parts.len() > 1 && parts.keys().copied().eq(0..parts.len() as u64);
-        if is_whole {
+        if is_whole && go_on(parts.values()) {
             groups.push((stem, parts.into_values().collect()));
         } else {
             groups.extend(parts.into_values().map(|path| (name_of(&path), vec![path])));
@@ -201,6 +208,27 @@ fn grouped(files: &[PathBuf]) -> Vec<(String, Vec<PathBuf>)> {
     groups.extend(files.iter().filter(|path| is_table(path)).map(|path| (name_of(path), vec![path.clone()])));
     groups.sort_by(|a, b| a.1.cmp(&b.1));
     groups
+}
+
+/// Returns whether each file goes on where the one before ends; those that do not say when they begin and end may.
+///
+/// One file per episode is often numbered as well.
+fn go_on<'a>(parts: impl Iterator<Item = &'a PathBuf>) -> bool {
+    let spans: Vec<Option<(u64, u64)>> = parts.map(|part| span_of(part)).collect();
+    spans.windows(2).all(|pair| match (pair[0], pair[1]) {
+        (Some((_, end)), Some((start, _))) => end.abs_diff(start) <= MAX_PART_GAP_NS,
+        _ => true,
+    })
+}
+
+/// Returns the first and the last log time that the summary of a file states.
+fn span_of(path: &Path) -> Option<(u64, u64)> {
+    let source = Source::open(path).ok()?;
+    let mut damage = Vec::new();
+    let tail = read_tail(&source, &mut damage).ok()??;
+    let summary = read_summary(&source, &tail, limits(&OpenOptions::default()), &mut damage).ok()??;
+    let statistics = summary.statistics.filter(|statistics| statistics.message_count > 0)?;
+    Some((statistics.message_start_time, statistics.message_end_time))
 }
 
 /// Tells a log by its name; rosbag2 may have compressed it as a whole.

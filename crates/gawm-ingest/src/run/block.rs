@@ -199,7 +199,7 @@ impl MessageDecoder<'_> {
         if let Some(image) = &self.plan.image {
             let message = image.extract(payload, &mut RowSink::new()).map_err(|error| loss_of(&error))?;
             let stamp_ns = message.stamp_ns;
-            let picture = Picture::new(&message, image.kind(), |data| self.keep(data))
+            let picture = Picture::new(&message, |data| self.keep(data))
                 .map_err(|error| MessageLoss { reason: loss_reason(&error), detail: error.to_string() })?;
             extras.picture = Some((picture, stamp_ns));
         }

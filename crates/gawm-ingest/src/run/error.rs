@@ -61,6 +61,22 @@ pub enum RunError {
         /// What does not fit.
         detail: String,
     },
+    /// A crop lies outside of the images.
+    #[error(
+        "stream {stream:?}: image.crop: expected one within the images of {topic}, {width}x{height}, got {crop:?} (x, y, width, height)"
+    )]
+    Crop {
+        /// The stream.
+        stream: String,
+        /// Its topic.
+        topic: String,
+        /// Width of the recorded images.
+        width: u32,
+        /// Height of the recorded images.
+        height: u32,
+        /// What the contract asks for.
+        crop: [u32; 4],
+    },
     /// The schemas folder cannot be used.
     #[error("{file}: schemas: {detail}")]
     Schemas {
@@ -112,7 +128,7 @@ pub enum RunError {
         age_ms: f64,
     },
     /// Nothing usable came of any input.
-    #[error("nothing was written: {}", list(.reasons))]
+    #[error("nothing was written:{}", gathered(.reasons))]
     Nothing {
         /// Why each input gave nothing.
         reasons: Vec<String>,
@@ -207,6 +223,11 @@ impl RunError {
             RunError::Write { source: gawm_dataset::WriteError::DiskFull { .. }, .. } => {
                 Some("make room and run the same command with --resume".to_owned())
             }
+            RunError::Write { source: gawm_dataset::WriteError::Io { source, .. }, .. }
+                if source.kind() == std::io::ErrorKind::NotADirectory =>
+            {
+                Some("a file is in the way: choose another --out".to_owned())
+            }
             RunError::Write {
                 source: gawm_dataset::WriteError::Io { .. } | gawm_dataset::WriteError::Parquet { .. },
                 ..
@@ -214,7 +235,7 @@ impl RunError {
             RunError::Gap { .. } => {
                 Some("gap = \"split\" or \"mask\" goes on, a larger tolerance_ms bridges it".to_owned())
             }
-            RunError::Interrupted => Some("run the same command with --resume to go on".to_owned()),
+            RunError::Interrupted => Some("run the same command with --resume (in place of --append) to go on".to_owned()),
             // The reasons bring their own.
             RunError::Nothing { reasons } if reasons.iter().any(|reason| reason.contains("\nhint: ")) => None,
             RunError::Nothing { .. } => {
@@ -232,6 +253,7 @@ impl RunError {
             | RunError::Path { .. }
             | RunError::NoMatch { .. }
             | RunError::Feature { .. }
+            | RunError::Crop { .. }
             | RunError::Schemas { .. }
             | RunError::Labels { .. } => 2,
             RunError::Interrupted => 130,
@@ -263,6 +285,33 @@ impl Refusal {
             Refusal::OtherSchema { .. } => Some("ingest it with its own contract into a dataset of its own".to_owned()),
         }
     }
+}
+
+/// Puts reasons on lines of their own, and each of their hints behind them once.
+fn gathered(reasons: &[String]) -> String {
+    const SHOWN: usize = 20;
+    let mut text = String::new();
+    let mut hints: Vec<&str> = Vec::new();
+    for (at, reason) in reasons.iter().enumerate() {
+        let (what, hint) =
+            reason.split_once("\nhint: ").map_or((reason.as_str(), None), |(what, hint)| (what, Some(hint)));
+        if at < SHOWN {
+            text.push_str(if reasons.len() > 1 { "\n  " } else { " " });
+            text.push_str(what);
+        }
+        hints.extend(hint.filter(|hint| !hints.contains(hint)));
+    }
+    if reasons.is_empty() {
+        text.push_str(" none");
+    }
+    if reasons.len() > SHOWN {
+        text.push_str(&format!("\n  and {} more", reasons.len() - SHOWN));
+    }
+    for hint in hints.iter().take(SHOWN) {
+        text.push_str("\nhint: ");
+        text.push_str(hint);
+    }
+    text
 }
 
 fn list(items: &[String]) -> String {

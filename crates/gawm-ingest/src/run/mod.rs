@@ -40,6 +40,7 @@ pub(crate) use plan::{Plans, schema_of};
 pub(crate) use publishers::split as split_by_publisher;
 pub(crate) use recording::OpenRecording;
 pub use report::{FileReport, FileStatus, LostReport, Report, StreamReport, TopicReport};
+pub(crate) use session::defect_of;
 pub(crate) use source::Source;
 
 use crate::contract::{CheckedContract, to_toml};
@@ -279,12 +280,17 @@ impl Run<'_> {
     }
 
     fn finish(self, report: &mut Report) -> Result<RunOutcome, RunError> {
-        let nothing = |report: &Report| RunError::Nothing {
-            reasons: report
+        let nothing = |report: &Report| {
+            let of_files = report
                 .files
                 .iter()
-                .map(|file| format!("{}: {}", file.path, file.error.as_deref().unwrap_or("no episode")))
-                .collect(),
+                .map(|file| format!("{}: {}", file.path, file.error.as_deref().unwrap_or("no episode")));
+            let of_shard = self.options.shard.filter(|_| report.files.is_empty()).map(|(shard, n)| {
+                format!(
+                    "no recording falls to shard {shard}/{n}\nhint: there are fewer recordings than shards; merge the others without it"
+                )
+            });
+            RunError::Nothing { reasons: of_files.chain(of_shard).collect() }
         };
         let Some(writer) = self.writer else { return Err(nothing(report)) };
         let schema = writer.schema().clone();

@@ -57,15 +57,14 @@ impl Picture {
     /// The bytes are no image of a known kind, or a part of it is missing.
     pub(crate) fn new(
         message: &ImageMessage<'_>,
-        kind: ImageKind,
         keep: impl FnOnce(&[u8]) -> Bytes,
     ) -> Result<Picture, ImageError> {
         let data: &[u8] = &message.data;
-        if kind == ImageKind::Video {
+        if message.kind == ImageKind::Video {
             let form = Form::Packet { format: message.format.clone().into_owned() };
             return Ok(Picture { data: keep(data), form, width: 0, height: 0, is_depth: false });
         }
-        if kind == ImageKind::Raw {
+        if message.kind == ImageKind::Raw {
             return raw(message, keep);
         }
         if is_compressed_depth(data) || message.format.contains("compressedDepth") {
@@ -165,6 +164,14 @@ impl Picture {
             _ => encode_png(&image)?,
         };
         Ok(Bytes::from(bytes))
+    }
+
+    /// Returns a black image, as it is stored.
+    pub(crate) fn black(spec: &ImageSpec) -> Bytes {
+        let n = spec.width as usize * spec.height as usize;
+        let pixels = if spec.depth { Pixels::Gray16(vec![0; n]) } else { Pixels::Rgb8(vec![0; 3 * n]) };
+        let image = Image::try_new(spec.width, spec.height, pixels);
+        image.and_then(|image| encode_png(&image)).map(Bytes::from).unwrap_or_default()
     }
 
     fn decoded(&self) -> Result<Image, ImageError> {

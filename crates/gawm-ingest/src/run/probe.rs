@@ -21,6 +21,8 @@ const RATE_SAMPLES: usize = 400;
 pub(crate) struct Probed {
     pub(crate) rate_hz: f64,
     pub(crate) sizes: BTreeMap<usize, ImageSpec>,
+    /// The first image that its crop does not fit: stream, width, height, crop.
+    misfit: Option<(usize, (u32, u32), [u32; 4])>,
     /// Image streams without a single image.
     pub(crate) without_size: Vec<usize>,
     /// Messages of image topics that were looked at.
@@ -49,6 +51,7 @@ pub(crate) fn probe(
     let mut probed = Probed {
         rate_hz: rate_hz.unwrap_or(0.0),
         sizes: BTreeMap::new(),
+        misfit: None,
         without_size: Vec::new(),
         read: 0,
         first_loss: None,
@@ -80,6 +83,9 @@ pub(crate) fn probe(
             if let Some(picture) = picture {
                 for &stream in &topic.images {
                     if let StreamData::Image(rule) = &binding.streams[stream].rule.data {
+                        let size = picture.recorded_size();
+                        let misfit = rule.spec.crop.filter(|crop| !fits(*crop, size));
+                        probed.misfit = probed.misfit.or(misfit.map(|crop| (stream, size, crop)));
                         probed.sizes.entry(stream).or_insert_with(|| picture.size(&rule.spec));
                     }
                 }
@@ -100,11 +106,21 @@ pub(crate) fn probe(
         }
         ControlFlow::Continue(())
     });
+    if let Some((stream, (width, height), crop)) = probed.misfit {
+        let bound = &binding.streams[stream];
+        let (stream, topic) = (bound.name.clone(), bound.topic.clone());
+        return Err(RunError::Crop { stream, topic, width, height, crop });
+    }
     probed.without_size = images.into_iter().filter(|stream| !probed.sizes.contains_key(stream)).collect();
     if reference.is_some() {
         probed.rate_hz = reference_rate(contract, &mut times)?;
     }
     Ok(probed)
+}
+
+fn fits([x, y, width, height]: [u32; 4], (image_width, image_height): (u32, u32)) -> bool {
+    x.checked_add(width).is_some_and(|right| right <= image_width)
+        && y.checked_add(height).is_some_and(|bottom| bottom <= image_height)
 }
 
 /// Looks for the first frame of a video topic.

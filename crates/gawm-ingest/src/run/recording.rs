@@ -26,6 +26,9 @@ use crate::log::{BlockRef, Channel, Damage, Recording, Severity};
 /// Decoded blocks that may wait at a time, in bytes.
 const PREFETCH_BYTES: u64 = 96 << 20;
 
+/// Reasons for labels that are not known that are listed.
+const MAX_UNLABELLED: usize = 10;
+
 /// What is needed to write recordings.
 pub(crate) struct Context<'a> {
     pub(crate) options: &'a RunOptions<'a>,
@@ -370,6 +373,13 @@ fn outcome(
             "{} episodes with {} rows in all were shorter than min_frames or min_length_s and are left out",
             result.short_episodes, result.short_frames
         ));
+    }
+    warnings.extend(result.unlabelled.iter().take(MAX_UNLABELLED).map(|(reason, count)| {
+        let noun = if *count == 1 { "episode" } else { "episodes" };
+        format!("{reason} ({count} {noun})")
+    }));
+    if result.unlabelled.len() > MAX_UNLABELLED {
+        warnings.push(format!("{} more labels that are not known", result.unlabelled.len() - MAX_UNLABELLED));
     }
     if !result.dropped_intervals.is_empty() {
         warnings.push(format!(

@@ -1,8 +1,9 @@
 //! One recording on its way through the aligner: order, duplicates, clock resets, marks, counts.
 
+mod marks;
 mod video;
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use gawm_schema::{FloatType, Kind, Role, rotation};
 
@@ -13,7 +14,7 @@ use super::plan::{Plans, Row};
 use super::report::Counts;
 use super::sink::{EpisodeSink, IntervalInfo};
 use crate::align::{AlignRule, Aligner, SampleTime, Stop};
-use crate::contract::{CheckedContract, Clock, EpisodeRule, GapRule, NonFiniteRule, StreamData};
+use crate::contract::{CheckedContract, Clock, EpisodeRule, GapRule, MarkerValue, NonFiniteRule, StreamData};
 use crate::decode::CameraInfo;
 use crate::episodes::{Mark, Marks};
 use crate::log::Damage;
@@ -52,6 +53,7 @@ pub(crate) struct Session<'a, 's> {
     videos: BTreeMap<usize, video::VideoTopic>,
     marks: BTreeMap<(i64, u64), Mark>,
     is_marked: bool,
+    mark_counts: marks::MarkCounts,
     recent: Vec<Recent>,
     sizes: BTreeMap<usize, (u32, u32)>,
     ordinal: u64,
@@ -131,6 +133,7 @@ impl<'a, 's> Session<'a, 's> {
             videos: BTreeMap::new(),
             marks: BTreeMap::new(),
             is_marked: false,
+            mark_counts: marks::MarkCounts::default(),
             recent: vec![Recent::default(); rules.plans.topics.len()],
             sizes: BTreeMap::new(),
             ordinal: 0,
@@ -166,13 +169,21 @@ impl<'a, 's> Session<'a, 's> {
             EpisodeRule::Metadata { record, start_key, end_key, scale_ns } => {
                 let records: Vec<_> =
                     self.sink.recording.metadata.iter().filter(|(name, _)| name == record).cloned().collect();
+                if records.is_empty() {
+                    let names: BTreeSet<&String> =
+                        self.sink.recording.metadata.iter().map(|(name, _)| name).collect();
+                    self.warn(format!(
+                        "episodes.record: there is no metadata record {record:?}, there are {names:?}"
+                    ));
+                }
                 let mut spans = Vec::new();
                 for found in records {
                     let time = |key: &str| found.1.get(key).and_then(|text| parse_time(text, *scale_ns));
                     match (time(start_key), time(end_key)) {
                         (Some(start), Some(end)) if start <= end => spans.push((start, end, found)),
-                        (start, end) => self.warn(format!(
-                            "metadata record {record:?}: expected times in {start_key:?} and {end_key:?}, got {start:?} and {end:?} ns; this episode is left out"
+                        _ => self.warn(format!(
+                            "metadata record {record:?}: expected a time in {start_key:?} and a later one in {end_key:?}, got {:?}; this episode is left out",
+                            found.1
                         )),
                     }
                 }
@@ -263,6 +274,10 @@ impl<'a, 's> Session<'a, 's> {
             self.warn(text);
         }
         self.warn_of_late_streams();
+        if let EpisodeRule::Marker { topic, field, start, stop, .. } = &self.rules.contract.episodes {
+            let marks = Marks { field: field.clone(), start: start.clone(), stop: stop.clone() };
+            self.mark_counts.complaint(topic, &marks).into_iter().for_each(|text| self.warn(text));
+        }
         if self.unclosed > 0 {
             let text = format!(
                 "{} episodes have no end mark; closed at the next start or at the end of the log",
@@ -337,16 +352,22 @@ impl<'a, 's> Session<'a, 's> {
 
     /// Opens and closes intervals by the marks before a time.
     fn apply_marks(&mut self, complete_ns: i64) {
+        let (has_stop, is_state) = match &self.rules.contract.episodes {
+            EpisodeRule::Marker { start, stop, .. } => {
+                let is_truth = |value: &MarkerValue| matches!(value, MarkerValue::Bool(_));
+                (stop.is_some(), is_truth(start) && stop.as_ref().is_some_and(is_truth))
+            }
+            _ => (false, false),
+        };
         while let Some(entry) = self.marks.first_entry().filter(|entry| entry.key().0 < complete_ns) {
             let ((time_ns, _), mark) = entry.remove_entry();
             let last = self.sink.intervals.keys().next_back().copied();
             match mark {
+                // A truth value is a state, which messages may repeat.
+                Mark::Start if self.is_marked && is_state => {}
+                Mark::Stop if !self.is_marked && is_state => {}
                 Mark::Start => {
                     if self.is_marked {
-                        let has_stop = matches!(
-                            &self.rules.contract.episodes,
-                            EpisodeRule::Marker { stop: Some(_), .. }
-                        );
                         self.unclosed += u64::from(has_stop);
                         self.aligner.close_interval(time_ns - 1);
                         self.set_end(last, time_ns - 1);
@@ -505,19 +526,8 @@ impl<'a, 's> Session<'a, 's> {
             && topic == name
         {
             let marks = Marks { field: field.clone(), start: start.clone(), stop: stop.clone() };
-            let stamp_ns = match clock {
-                Clock::Field(path) => crate::episodes::value_at(event, path)
-                    .and_then(|value| value.as_f64())
-                    .map(|value| if value.abs() < 1e12 { value * 1e9 } else { value })
-                    .map(|ns| ns as i64),
-                _ => None,
-            };
-            let time_ns = match (clock, stamp_ns) {
-                (Clock::Field(_), Some(ns)) => ns,
-                (Clock::Publish, _) => message.publish_ns,
-                _ => message.log_ns,
-            };
-            if let Some(mark) = marks.read(event) {
+            if let Some(mark) = self.mark_counts.take(&marks, event) {
+                let time_ns = marks::time_of(clock, event, message.publish_ns, message.log_ns);
                 self.marks.insert((time_ns, self.ordinal), mark);
             }
         }
@@ -527,8 +537,12 @@ impl<'a, 's> Session<'a, 's> {
 
 /// Returns what keeps a sample from being used, if anything; it is then no number any more.
 ///
-/// States and actions are encoded as 32-bit floats, and their rotations need a direction.
-fn defect_of(values: &mut [f64], kind: Kind, (is_encoded, is_float32): (bool, bool)) -> Option<&'static str> {
+/// States and actions are encoded as 32-bit floats, and their rotations need a direction; truth values are 0 or 1.
+pub(crate) fn defect_of(
+    values: &mut [f64],
+    kind: Kind,
+    (is_encoded, is_float32): (bool, bool),
+) -> Option<&'static str> {
     let defect = if values.iter().any(|value| !value.is_finite()) {
         "NaN or infinity"
     } else if is_float32 && values.iter().any(|value| !(*value as f32).is_finite()) {
@@ -536,10 +550,12 @@ fn defect_of(values: &mut [f64], kind: Kind, (is_encoded, is_float32): (bool, bo
     } else if is_encoded && values.chunks_exact(kind.raw_width()).any(|element| !has_rotation(kind, element))
     {
         "quaternions or matrices that are no rotation"
+    } else if kind == Kind::Bool && values.iter().any(|value| ![0.0, 1.0].contains(value)) {
+        "truth values other than 0 and 1"
     } else {
         return None;
     };
-    if is_float32 {
+    if is_float32 || kind == Kind::Bool {
         values.fill(f64::NAN);
     }
     Some(defect)

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use bytes::Bytes;
 use gawm_dataset::{AgeColumns, DatasetWriter, EpisodeInfo, ImageColumn, Rows, Trajectory, VectorColumn};
-use gawm_schema::{Role, Schema};
+use gawm_schema::{ImageSpec, Role, Schema};
 use rayon::prelude::*;
 
 use super::RunError;
@@ -30,6 +30,13 @@ pub(crate) struct SinkRules<'a> {
     pub(crate) pool: &'a rayon::ThreadPool,
     /// Streams of each feature, to count rows that are not valid.
     pub(crate) feature_streams: Vec<Vec<usize>>,
+}
+
+impl SinkRules<'_> {
+    /// Returns the size of the frames of a camera.
+    fn image_spec(&self, index: usize) -> Option<ImageSpec> {
+        self.schema.images().nth(index).map(|(_, spec)| spec.clone())
+    }
 }
 
 /// Writes the episodes of one recording; errors are kept for the caller.
@@ -71,13 +78,19 @@ pub(crate) struct SinkOutcome {
     pub(crate) gaps: Vec<GapEvent>,
     pub(crate) ages: Vec<AgeCounts>,
     pub(crate) failed_pictures: u64,
+    /// Why labels are not known, and of how many episodes.
+    pub(crate) unlabelled: BTreeMap<String, u64>,
 }
 
 struct OpenEpisode {
     start: EpisodeStart,
     info: Option<EpisodeInfo>,
+    /// Why labels are not known.
+    unlabelled: BTreeSet<String>,
     is_skipped: bool,
     rows: PendingRows,
+    /// The newest frame of each camera that was written.
+    last_frames: BTreeMap<usize, Bytes>,
     first_ns: i64,
     last_ns: i64,
     length: u64,
@@ -129,8 +142,9 @@ impl<'a> EpisodeSink<'a> {
                 return Ok(());
             }
         }
-        let info = self.episode_info();
+        let (info, unlabelled) = self.episode_info();
         let Some(open) = self.open.as_mut() else { return Ok(()) };
+        open.unlabelled = unlabelled;
         let Some(writer) = self.writer.as_deref_mut() else {
             open.info = Some(info);
             open.rows = PendingRows::default();
@@ -145,12 +159,13 @@ impl<'a> EpisodeSink<'a> {
         }
         let mut pending = std::mem::take(&mut open.rows);
         // The last row is held back, so that there is one to end the episode with.
-        self.outcome.failed_pictures += pending.write(&self.log, self.rules, writer)?;
+        self.outcome.failed_pictures +=
+            pending.write(&self.log, self.rules, &mut open.last_frames, writer)?;
         Ok(())
     }
 
-    fn episode_info(&self) -> EpisodeInfo {
-        let Some(open) = &self.open else { return EpisodeInfo::default() };
+    fn episode_info(&self) -> (EpisodeInfo, BTreeSet<String>) {
+        let Some(open) = &self.open else { return Default::default() };
         let interval = self.intervals.get(&(open.start.interval + self.interval_base));
         let end_ns = interval.and_then(|interval| interval.end_ns).unwrap_or(open.last_ns).max(open.last_ns);
         let asked = crate::episodes::Asked {
@@ -159,8 +174,8 @@ impl<'a> EpisodeSink<'a> {
             end_ns,
             record: interval.and_then(|interval| interval.record.as_ref()),
         };
-        let EpisodeLabels { task, success, operator, robot, session } =
-            self.rules.labels.of(&self.recording, asked);
+        let (labels, unlabelled) = self.rules.labels.of(&self.recording, asked);
+        let EpisodeLabels { task, success, operator, robot, session } = labels;
         let mut tags = BTreeMap::new();
         if open.start.part > 0 {
             tags.insert("part".to_owned(), open.start.part.to_string());
@@ -170,7 +185,7 @@ impl<'a> EpisodeSink<'a> {
                 tags.insert(format!("metadata.{key}"), value.clone());
             }
         }
-        EpisodeInfo {
+        let info = EpisodeInfo {
             id: String::new(),
             task,
             success,
@@ -182,7 +197,8 @@ impl<'a> EpisodeSink<'a> {
             end_ns: open.last_ns,
             source_file: String::new(),
             tags,
-        }
+        };
+        (info, unlabelled)
     }
 
     fn keep_error(&mut self, result: Result<(), RunError>) {
@@ -209,6 +225,9 @@ impl<'a> EpisodeSink<'a> {
         }
         self.outcome.episodes += 1;
         self.outcome.frames += open.length;
+        for reason in open.unlabelled {
+            *self.outcome.unlabelled.entry(reason).or_default() += 1;
+        }
         for (total, ages) in self.outcome.ages.iter_mut().zip(&open.ages) {
             total.merge(ages);
         }
@@ -230,7 +249,9 @@ impl RowSink<Picture> for EpisodeSink<'_> {
             is_skipped: self.discarded.contains(&(start.interval + self.interval_base)),
             start,
             info: None,
+            unlabelled: BTreeSet::new(),
             rows,
+            last_frames: BTreeMap::new(),
             first_ns: start.start_ns,
             last_ns: start.start_ns,
             length: 0,
@@ -320,6 +341,7 @@ impl PendingRows {
         &mut self,
         log: &str,
         rules: &SinkRules<'_>,
+        last_frames: &mut BTreeMap<usize, Bytes>,
         writer: &mut DatasetWriter,
     ) -> Result<u64, RunError> {
         let mut failed = 0;
@@ -333,7 +355,10 @@ impl PendingRows {
             let encode = |picture: &Picture| picture.encoded(rule).ok();
             let encoded: Vec<Option<Bytes>> =
                 rules.pool.install(|| pictures.par_iter().map(encode).collect());
-            let fallback = encoded.iter().flatten().next().cloned().unwrap_or_default();
+            // Where nothing precedes a damaged one, one that follows stands in, or a black one: the row is not valid.
+            let stand_in = last_frames.get(&index).or(encoded.iter().flatten().next()).cloned();
+            let fallback =
+                stand_in.or_else(|| rules.image_spec(index).as_ref().map(Picture::black)).unwrap_or_default();
             let mut frames: Vec<Bytes> = Vec::with_capacity(encoded.len());
             for (row, frame) in encoded.into_iter().enumerate() {
                 frames.push(frame.unwrap_or_else(|| {
@@ -341,6 +366,9 @@ impl PendingRows {
                     valid[row] = false;
                     frames.last().cloned().unwrap_or_else(|| fallback.clone())
                 }));
+            }
+            if let Some(last) = frames.last() {
+                last_frames.insert(index, last.clone());
             }
             images.push(ImageColumn { frames, valid });
         }

@@ -340,3 +340,47 @@ fn a_suggestion_takes_the_task_beside_the_episode_marks_and_lists_what_it_leaves
     let outcome = run_of(&contract, &made.log, &made.out).0.unwrap();
     assert_eq!((outcome.report.episodes, outcome.has_loss()), (2, false), "{:#?}", outcome.report);
 }
+
+#[test]
+fn a_suggestion_knows_images_without_a_schema_and_the_order_that_a_name_says() {
+    let mut sent: Vec<Sent> = Vec::new();
+    for i in 0..60_u64 {
+        let (sin, cos) = (i as f64 / 50.0).sin_cos();
+        sent.push(("/body", 20 * i, format!(r#"{{"quat_wxyz":[{cos},0.0,0.0,{sin}]}}"#)));
+        let pixels = format!(r#""height":1,"width":2,"encoding":"rgb8","step":6,"data":[{i},2,3,4,5,6]"#);
+        sent.push(("/camera", 20 * i, format!(r#"{{"is_bigendian":0,{pixels}}}"#)));
+    }
+    let made = made(&sent);
+    let suggestion =
+        suggest(std::slice::from_ref(&made.log), &SchemaLibrary::builtin(), &OpenOptions::default()).unwrap();
+    let text = to_toml(&suggestion);
+    assert!(text.contains("order = \"wxyz\"") && text.contains("in w, x, y, z order"), "{text}");
+    assert!(text.contains("observation.images.camera"), "{text}");
+    let contract = contract::check(&contract::parse(&text, "s.toml", &[]).unwrap(), "s.toml").unwrap();
+    let outcome = run_of(&contract, &made.log, &made.out).0.unwrap();
+    assert_eq!((outcome.report.frames, outcome.has_loss()), (60, false), "{:#?}", outcome.report);
+}
+
+#[test]
+fn a_suggestion_takes_the_rate_of_bursts_with_pauses_between() {
+    let mut sent: Vec<Sent> = Vec::new();
+    for episode in 0..3_u64 {
+        for i in 0..40 {
+            sent.push(("/x", 9000 * episode + 20 * i, format!(r#"{{"v":[{i},1.5]}}"#)));
+        }
+        sent.push(("/done", 9000 * episode + 800, format!(r#"{{"ok":{}}}"#, episode != 1)));
+    }
+    let made = made(&sent);
+    let suggestion =
+        suggest(std::slice::from_ref(&made.log), &SchemaLibrary::builtin(), &OpenOptions::default()).unwrap();
+    let text = to_toml(&suggestion);
+    assert_eq!(suggestion.contract.ticks.rate_hz, Some(50.0), "{text}");
+    let contract = contract::check(&contract::parse(&text, "s.toml", &[]).unwrap(), "s.toml").unwrap();
+    let outcome = run_of(&contract, &made.log, &made.out).0.unwrap();
+    // The last sample of a burst serves for as long as the tolerance says.
+    assert!(
+        outcome.report.episodes == 3 && (120..130).contains(&outcome.report.frames),
+        "{:#?}",
+        outcome.report
+    );
+}

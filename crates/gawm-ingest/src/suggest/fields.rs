@@ -275,9 +275,14 @@ fn quaternion_array(path: &str, n: usize, messages: &[Value]) -> Option<String> 
         Some(numbers?.iter().map(|value| value * value).sum::<f64>().sqrt())
     };
     let unit = messages.iter().filter_map(norm).filter(|norm| (norm - 1.0).abs() < 0.01).count();
-    (is_named && is_most(unit, messages.len())).then(|| {
-        "four numbers of length 1 named as a quaternion; that their order is x, y, z, w is a guess".to_owned()
-    })
+    let reason = if names::says_wxyz(base) {
+        "four numbers of length 1 named as a quaternion in w, x, y, z order"
+    } else if names::words(base).iter().any(|word| word == "xyzw") {
+        "four numbers of length 1 named as a quaternion in x, y, z, w order"
+    } else {
+        "four numbers of length 1 named as a quaternion; that their order is x, y, z, w is a guess"
+    };
+    (is_named && is_most(unit, messages.len())).then(|| reason.to_owned())
 }
 
 /// Returns the number of values that most messages have in an array.

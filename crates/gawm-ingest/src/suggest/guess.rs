@@ -181,7 +181,7 @@ fn is_camera(topic: &Topic, library: &SchemaLibrary) -> Option<Result<(u32, u32)
         let message = plan.extract(sample, &mut RowSink::new());
         match message.map_err(|error| error.to_string()).and_then(|message| {
             let keep = |data: &[u8]| bytes::Bytes::copy_from_slice(data);
-            Picture::new(&message, plan.kind(), keep).map_err(|error| error.to_string())
+            Picture::new(&message, keep).map_err(|error| error.to_string())
         }) {
             Ok(picture) if picture.packet().is_some() => return Some(video_size(topic, &plan)),
             Ok(picture) => return Some(Ok(picture.recorded_size())),
@@ -287,7 +287,7 @@ fn add_groups(
         stream.unit.clone_from(&group.unit);
         stream.limits.clone_from(&group.limits);
         stream.order = (group.kind == KindSpec::Quaternion).then(|| {
-            if group.fields.first().is_some_and(|field| field.ends_with(".w")) {
+            if group.fields.first().is_some_and(|field| field.ends_with(".w") || names::says_wxyz(field)) {
                 QuaternionOrder::Wxyz
             } else {
                 QuaternionOrder::Xyzw
@@ -556,7 +556,8 @@ fn set_rate(suggestion: &mut Suggestion, survey: &Survey, found: &[(&Topic, Gues
         let colour = own.clone().filter(|stream| !is_depth(stream)).filter_map(rate_of).reduce(f64::min);
         colour.or(own.filter_map(rate_of).reduce(f64::min))
     };
-    let fastest = suggestion.contract.stream.iter().filter_map(rate_of).reduce(f64::max);
+    let is_measured = |stream: &&StreamSpec| stream.role != Some(RoleSpec::Annotation);
+    let fastest = suggestion.contract.stream.iter().filter(is_measured).filter_map(rate_of).reduce(f64::max);
     let (mut rate, mut reason) = match (slowest(RoleSpec::Image), slowest(RoleSpec::State)) {
         (Some(rate), _) => (rate, format!("the slowest camera has {rate:.3} Hz")),
         (None, Some(rate)) => (rate, format!("the slowest state stream has {rate:.3} Hz")),

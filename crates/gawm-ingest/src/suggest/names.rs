@@ -21,6 +21,11 @@ pub(crate) fn words(name: &str) -> Vec<String> {
     words
 }
 
+/// Returns whether a name says that a quaternion begins with its real part.
+pub(crate) fn says_wxyz(name: &str) -> bool {
+    has(name, &["wxyz"])
+}
+
 fn has(name: &str, wanted: &[&str]) -> bool {
     words(name).iter().any(|word| wanted.contains(&word.as_str()))
 }

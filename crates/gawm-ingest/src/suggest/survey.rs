@@ -19,6 +19,12 @@ const SAMPLES: usize = 48;
 const MAX_TIMES: usize = 400_000;
 /// Largest message body that is unpacked.
 const MAX_BODY_BYTES: u64 = 256 << 20;
+/// An interval of more than this many median ones, and of more than [`PAUSE_MS`], is a pause.
+const PAUSE_PERIODS: f64 = 20.0;
+/// The shortest pause.
+const PAUSE_MS: f64 = 1000.0;
+/// Where one interval in this many is a pause, they are the nature of the topic.
+const PAUSE_EVERY: usize = 20;
 /// Larger payloads are kept twice only.
 const LARGE_BYTES: usize = 1 << 16;
 
@@ -312,6 +318,8 @@ impl Steps {
 }
 
 /// Returns the median interval and the one that a percent exceed, in ms, by publish time and within clock segments.
+///
+/// Pauses of the recorder, between episodes for one, say nothing of the rate.
 fn intervals(times: &[Times], resets: &[usize]) -> (f64, f64) {
     let mut all = Vec::new();
     let mut ends = resets.to_vec();
@@ -325,8 +333,12 @@ fn intervals(times: &[Times], resets: &[usize]) -> (f64, f64) {
         start = end;
     }
     all.sort_by(f64::total_cmp);
-    let at = |share: f64| {
+    let at = |all: &[f64], share: f64| {
         all.get(((all.len().saturating_sub(1)) as f64 * share).round() as usize).copied().unwrap_or(0.0)
     };
-    (at(0.5), at(0.99))
+    let median = at(&all, 0.5);
+    let n_steady = all.partition_point(|ms| *ms <= (PAUSE_PERIODS * median).max(PAUSE_MS));
+    let has_few_pauses = (all.len() - n_steady) * PAUSE_EVERY <= all.len();
+    let steady = if has_few_pauses { &all[..n_steady] } else { &all };
+    (median, at(steady, 0.99))
 }

@@ -40,11 +40,16 @@ pub(crate) fn transforms(topic: &Topic, messages: &[Value]) -> Option<Vec<Group>
         }
     }
     let is_stamped = has_stamps(topic, messages);
-    let mut groups = Vec::new();
+    let mut groups: Vec<Group> = Vec::new();
+    let mut left_out: Vec<&str> = Vec::new();
     for (name, poses) in frames {
         let share = poses.len() as f64 / messages.len() as f64;
         let is_moving = poses.windows(2).any(|pair| pair[0] != pair[1]);
-        if !is_moving || share < MIN_SHARE || groups.len() >= 2 * MAX_FRAMES {
+        if !is_moving {
+            continue;
+        }
+        if share < MIN_SHARE || groups.len() >= 2 * MAX_FRAMES {
+            left_out.push(name);
             continue;
         }
         let quoted = name.replace('\\', "\\\\").replace('"', "\\\"");
@@ -67,6 +72,14 @@ pub(crate) fn transforms(topic: &Topic, messages: &[Value]) -> Option<Vec<Group>
         groups.push(group(translation, KindSpec::Linear, Some("m"), &["x", "y", "z"]));
         let rotation = paths("rotation", &["x", "y", "z", "w"]);
         groups.push(group(rotation, KindSpec::Quaternion, None, &["qx", "qy", "qz", "qw"]));
+    }
+    if let (Some(last), false) = (groups.last_mut(), left_out.is_empty()) {
+        let what = format!(
+            "; left out, as they are in under {:.0} % of the messages or more than {MAX_FRAMES}: {}",
+            MIN_SHARE * 100.0,
+            left_out.join(", ")
+        );
+        last.reason.push_str(&what);
     }
     (!groups.is_empty()).then_some(groups)
 }

@@ -184,7 +184,8 @@ impl<'a> Compiler<'a> {
         if prim == Prim::Bytes && want == Want::Scalars {
             return Err(self.wrong_shape(path, "a number, bool or text", "base64 bytes"));
         }
-        self.requests.leaves.push(Leaf { path: text(done), prim });
+        let is_optional = want == Want::Optional;
+        self.requests.leaves.push(Leaf { path: text(done), prim, is_optional });
         let hops = self.insert(done, slot);
         self.requests.all.push(Request { hops, target: Target::Slot(slot) });
         Ok(())
@@ -277,7 +278,7 @@ impl Compiler<'_> {
     pub(crate) fn add_stamp(&mut self, way: &[Segment], width: usize) {
         for slot in [width, width + 1] {
             if self.requests.leaves.len() <= slot {
-                self.requests.leaves.push(Leaf { path: text(way), prim: Prim::F64 });
+                self.requests.leaves.push(Leaf { path: text(way), prim: Prim::F64, is_optional: true });
             }
         }
         self.insert(way, width);

@@ -50,7 +50,7 @@ pub(crate) fn run<'a, E: Emit<'a>>(
     scan.end()?;
     for request in &requests.all {
         let Target::Slot(slot) = request.target else { continue };
-        if slot >= width || scratch.set[slot] {
+        if slot >= width || scratch.set[slot] || requests.leaves[slot].is_optional {
             continue;
         }
         // A list that is not there is a fault; one without the element is only a message without it.

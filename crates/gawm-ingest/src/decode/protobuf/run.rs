@@ -49,7 +49,7 @@ pub(crate) fn finish(requests: &Requests, width: usize, scratch: &mut Scratch) -
     }
     for request in &requests.all {
         let Target::Slot(slot) = request.target else { continue };
-        if slot >= width || scratch.set[slot] {
+        if slot >= width || scratch.set[slot] || requests.leaves[slot].is_optional {
             continue;
         }
         let unmatched = request.hops.iter().find_map(|hop| match hop {

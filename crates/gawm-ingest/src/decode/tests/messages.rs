@@ -486,6 +486,26 @@ fn stamps_in_their_places() {
     assert_eq!(read(r#"{"v": 1, "stamp": {"sec": 5, "nanosec": 0}}"#, &StampSource::None), None);
 }
 
+/// Messages without a schema, whatever the type is called, tell by their members what they hold.
+fn check_open_images(library: &SchemaLibrary) {
+    let read = |schema_name: &str, message: &str| {
+        let plan = ImagePlan::compile(&ChannelSchema { schema_name, ..JSON }, library).unwrap();
+        let got = plan.extract(message.as_bytes(), &mut RowSink::new()).unwrap();
+        (got.kind, got.format.into_owned(), got.width, got.step, got.is_big_endian, got.data.into_owned())
+    };
+    let raw = r#"{"header": {}, "height": 1, "width": 2, "encoding": "16UC1", "is_bigendian": 1, "step": 4, "data": "AQIDBA=="}"#;
+    for name in ["", "sensor_msgs/msg/Image", "foxglove.CompressedImage"] {
+        let expected = (ImageKind::Raw, "16UC1".to_owned(), 2, 4, true, vec![1, 2, 3, 4]);
+        assert_eq!(read(name, raw), expected, "{name}");
+    }
+    let file = (ImageKind::Compressed, "jpeg".to_owned(), 0, 0, false, vec![1, 2, 3]);
+    assert_eq!(read("", r#"{"format": "jpeg", "data": "AQID"}"#), file);
+    assert_eq!(read("sensor_msgs/msg/Image", r#"{"data": [1, 2, 3], "encoding": "jpeg"}"#), file);
+    let plan = ImagePlan::compile(&JSON, library).unwrap();
+    let lacking = plan.extract(br#"{"format": "jpeg"}"#, &mut RowSink::new());
+    assert!(matches!(lacking, Err(DecodeError::FieldAbsent { path, .. }) if path == "data"));
+}
+
 #[test]
 fn images_of_all_four_types_in_every_encoding() {
     let library = SchemaLibrary::builtin();
@@ -498,7 +518,7 @@ fn images_of_all_four_types_in_every_encoding() {
     cdr.0.extend(pixels);
     let message = cdr.done();
     let image = ImagePlan::compile(&raw, &library).unwrap();
-    assert_eq!(image.kind(), ImageKind::Raw);
+    assert_eq!(image.kind(), Some(ImageKind::Raw));
     let got = image.extract(&message, &mut sink).unwrap();
     assert_eq!((got.width, got.height, got.step, &*got.format, &*got.frame_id), (2, 1, 6, "rgb8", "cam"));
     assert!(matches!(got.data, std::borrow::Cow::Borrowed(data) if data == pixels));
@@ -514,6 +534,8 @@ fn images_of_all_four_types_in_every_encoding() {
     let message = br#"{"width": 1, "height": 1, "encoding": "rgb8", "step": 3, "data": [1, 2, 3]}"#;
     let got = ImagePlan::compile(&raw_json, &library).unwrap().extract(message, &mut sink).unwrap();
     assert_eq!((got.width, got.step, &got.data[..]), (1, 3, &[1, 2, 3][..]));
+
+    check_open_images(&library);
 
     let set = descriptor_set(
         r#"syntax = "proto3"; package test; message T { int64 seconds = 1; int32 nanos = 2; }
@@ -534,7 +556,7 @@ fn images_of_all_four_types_in_every_encoding() {
     let video = ChannelSchema { schema_name: "foxglove.CompressedVideo", ..JSON };
     let compiled = ImagePlan::compile(&video, &library);
     match cfg!(feature = "video") {
-        true => assert_eq!(compiled.unwrap().kind(), ImageKind::Video),
+        true => assert_eq!(compiled.unwrap().kind(), Some(ImageKind::Video)),
         false => assert!(matches!(compiled, Err(CompileError::NotAnImage { .. }))),
     }
 }

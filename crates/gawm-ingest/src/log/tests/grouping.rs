@@ -59,6 +59,36 @@ fn a_folder_without_metadata_is_grouped_by_part_numbers() {
     assert_eq!(recordings(&[folder.path().into()])[0], "x: x_0.mcap x_1.mcap x_2.mcap");
 }
 
+/// Writes a log of two messages, at the seconds given.
+fn timed(path: &std::path::Path, seconds: [u64; 2]) {
+    let mut writer = mcap::Writer::new(std::io::BufWriter::new(fs::File::create(path).unwrap())).unwrap();
+    let channel_id = writer.add_channel(0, "/x", "json", &std::collections::BTreeMap::new()).unwrap();
+    for (sequence, second) in (0..).zip(seconds) {
+        let time = second * 1_000_000_000;
+        let header =
+            mcap::records::MessageHeader { channel_id, sequence, log_time: time, publish_time: time };
+        writer.write_to_known_channel(&header, b"{}").unwrap();
+    }
+    writer.finish().unwrap();
+}
+
+#[test]
+fn numbered_files_are_parts_only_where_one_goes_on_where_the_other_ends() {
+    let check = |spans: [[u64; 2]; 3], expected: &[&str]| {
+        let folder = tempfile::tempdir().unwrap();
+        for (number, span) in spans.into_iter().enumerate() {
+            timed(&folder.path().join(format!("x_{number}.mcap")), span);
+        }
+        assert_eq!(recordings(&[folder.path().into()]), expected, "{spans:?}");
+    };
+    let apart = ["x_0.mcap: x_0.mcap", "x_1.mcap: x_1.mcap", "x_2.mcap: x_2.mcap"];
+    check([[10, 20], [20, 30], [31, 40]], &["x: x_0.mcap x_1.mcap x_2.mcap"]);
+    // One file per episode: with breaks, out of order, or each from the beginning of a simulation.
+    check([[10, 20], [20, 30], [60, 70]], &apart);
+    check([[40, 50], [20, 30], [10, 20]], &apart);
+    check([[0, 20], [0, 20], [0, 20]], &apart);
+}
+
 #[test]
 fn a_folder_with_metadata_is_one_recording_in_its_order() {
     let text = bag(&["b.mcap", "run/a.mcap"]);
