@@ -218,9 +218,9 @@ fn collect_samples(open: &OpenRecording, topics: &mut BTreeMap<String, Topic>, l
         }
     }
     for topic in topics.values_mut() {
-        if let Some(sample) = topic.samples.first() {
-            topic.fields = sample_fields(&schema_of(&topic.channel), sample, library).unwrap_or_default();
-        }
+        let schema = schema_of(&topic.channel);
+        let mut found = topic.samples.iter().map(|sample| sample_fields(&schema, sample, library));
+        topic.fields = found.find_map(Result::ok).unwrap_or_default();
     }
 }
 
