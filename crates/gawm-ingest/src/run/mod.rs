@@ -193,6 +193,7 @@ impl Run<'_> {
             Ok(binding) => binding,
             Err(BindError::Run(error)) => return Err(error),
             Err(BindError::Refused(refusal)) => {
+                let refusal = unavailable::explain(refusal, &open);
                 return Ok(FileReport::refused(&path, with_hint(&refusal.to_string(), refusal.hint())));
             }
         };

@@ -210,6 +210,14 @@ impl Source {
         matches!(self, Source::Rows(_))
     }
 
+    /// Says why what is in the file under the name of a topic is not offered as one, and what to do.
+    pub(crate) fn why_not_offered(&self, topic: &str) -> Option<(String, Option<&'static str>)> {
+        match self {
+            Source::Log(_) | Source::Packed { .. } => None,
+            Source::Rows(rows) => rows.why_not_offered(topic),
+        }
+    }
+
     /// Returns the topics that are declared and have no values.
     pub(crate) fn unavailable(&self) -> &[Unavailable] {
         match self {

@@ -7,9 +7,12 @@ use base64::Engine as _;
 use gawm_dataset::read::{Dataset, FrameBytes, ReadLimits};
 
 use super::tests::{fixture, number_of, packets};
+use crate::decode::SchemaLibrary;
+use crate::log::OpenOptions;
 use crate::rows::{push_bytes, push_header, push_text};
 use crate::run::made_logs::{LogWriter, run_over};
 use crate::run::{FileStatus, RunOutcome};
+use crate::suggest::{suggest, to_toml};
 
 const CAMERA: &str = "observation.images.cam";
 
@@ -174,6 +177,19 @@ fn videos_of_a_folder_are_cameras() {
         files.push(fs::read(out.join("data/chunk-000/file-000.parquet")).unwrap());
     }
     assert!(files[0] == files[1], "the bytes depend on the number of jobs");
+}
+
+#[test]
+fn a_suggested_contract_maps_videos() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = folder(dir.path(), ["h264.mp4", "av1.mp4"]);
+    let inputs = [root.clone()];
+    let suggestion = suggest(&inputs, &SchemaLibrary::builtin(), &OpenOptions::default()).unwrap();
+    let text = to_toml(&suggestion);
+    let out = dir.path().join("out");
+    let outcome = run_over(&text, &root, &out, 2).unwrap();
+    assert_eq!(outcome.report.files[0].status, FileStatus::Ok, "{:#?}", outcome.report);
+    assert_eq!(numbers(&out), (0..30).chain(0..20).collect::<Vec<_>>(), "{text}");
 }
 
 #[test]
