@@ -1,6 +1,7 @@
 //! Frames of one MP4 file, by time, in one pass.
 
 use std::collections::VecDeque;
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use ffmpeg_next as ffmpeg;
@@ -37,6 +38,13 @@ pub(super) struct VideoFile {
     complaint: Option<String>,
 }
 
+/// Whether git has put a pointer in place of a large file.
+fn is_git_lfs_pointer(path: &Path) -> bool {
+    const BEGINNING: &[u8] = b"version https://git-lfs";
+    let mut head = [0; BEGINNING.len()];
+    std::fs::File::open(path).and_then(|mut file| file.read_exact(&mut head)).is_ok() && head == BEGINNING
+}
+
 impl VideoFile {
     /// Opens a file; only as MP4, whatever it says it is, and without anything that it refers to.
     pub(super) fn open(path: &Path) -> Result<VideoFile, VideoError> {
@@ -48,8 +56,13 @@ impl VideoFile {
         options.set("protocol_whitelist", "file");
         options.set("format_whitelist", "mov,mp4,m4a,3gp,3g2,mj2");
         options.set("codec_whitelist", "h264,hevc,libdav1d,av1,vp9");
-        let input = ffmpeg::format::input_with_dictionary(&format!("file:{text}"), options)
-            .map_err(|error| failed(error.to_string()))?;
+        let input =
+            ffmpeg::format::input_with_dictionary(&format!("file:{text}"), options).map_err(|error| {
+                match is_git_lfs_pointer(path) {
+                    true => failed("it is a git LFS pointer, `git lfs pull` fetches the video".to_owned()),
+                    false => failed(error.to_string()),
+                }
+            })?;
         let found = input.streams().best(Type::Video);
         let found = found.ok_or_else(|| failed("it has no video stream".to_owned()))?;
         let (stream, base) = (found.index(), found.time_base());
