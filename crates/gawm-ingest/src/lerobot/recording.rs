@@ -418,7 +418,7 @@ fn off_grid(episode: i64, largest: f64, fps: f64) -> Option<Damage> {
         kind: DamageKind::IndexMismatch,
         offset: 0,
         detail: format!(
-            "episode {episode}: timestamp is up to {largest:.3} s from frame_index / fps; rows keep the grid"
+            "episode {episode}: timestamp is up to {largest:.3} s from frame_index / fps; rows keep the grid, frames of videos follow timestamp"
         ),
     })
 }
