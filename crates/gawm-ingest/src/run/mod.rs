@@ -40,7 +40,7 @@ pub(crate) use plan::{Plans, schema_of};
 pub(crate) use publishers::split as split_by_publisher;
 pub(crate) use recording::OpenRecording;
 pub use report::{FileReport, FileStatus, LostReport, Report, StreamReport, TopicReport};
-pub(crate) use source::Source;
+pub(crate) use source::{OpenError, Source};
 
 use crate::contract::{CheckedContract, to_toml};
 use crate::decode::SchemaLibrary;

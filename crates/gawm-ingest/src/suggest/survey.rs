@@ -10,7 +10,7 @@ use bytes::Bytes;
 use super::SuggestError;
 use crate::decode::{DecodePlan, Decoded, FieldInfo, RowSink, SchemaLibrary, StampSource, sample_fields};
 use crate::inspect::{ChannelProbe, ChannelReport, MessageProbe, inspect_log};
-use crate::log::{Channel, Log, OpenOptions, decompress_message, discover, looks_like_zstd};
+use crate::log::{Channel, OpenOptions, decompress_message, discover, looks_like_zstd};
 use crate::run::{OpenRecording, Source, schema_of};
 
 /// Payloads that are kept per topic.
@@ -112,9 +112,10 @@ pub(crate) fn survey(
     let mut recordings = 0;
     let mut steps = Steps::default();
     for recording in &found.recordings {
-        let logs: Result<Vec<Log>, _> = recording.parts.iter().map(|path| Log::open(path, options)).collect();
-        let logs = match logs {
-            Ok(logs) => logs,
+        let sources: Result<Vec<Source>, _> =
+            recording.parts.iter().map(|path| Source::open_log(path, options)).collect();
+        let sources = match sources {
+            Ok(sources) => sources,
             Err(error) => {
                 hint = hint.or(error.hint());
                 reasons.push(error.to_string());
@@ -122,7 +123,6 @@ pub(crate) fn survey(
             }
         };
         recordings += 1;
-        let sources = logs.into_iter().map(|log| Source::Log(Box::new(log))).collect();
         let open = OpenRecording::of(recording.name.clone(), sources);
         let mut seen: BTreeMap<String, Topic> = BTreeMap::new();
         for log in open.logs.iter().filter_map(Source::as_log) {
