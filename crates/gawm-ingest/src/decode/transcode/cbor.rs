@@ -90,7 +90,7 @@ impl Element {
 }
 
 fn push_typed(element: Element, bytes: &[u8], out: &mut Vec<u8>) -> Result<(), DecodeError> {
-    if bytes.len() % element.size != 0 {
+    if !bytes.len().is_multiple_of(element.size) {
         let detail = format!("expected whole numbers of {} bytes, got {} bytes", element.size, bytes.len());
         return Err(malformed(0, detail));
     }
