@@ -5,7 +5,7 @@
 mod support;
 
 use gawm_ingest::tabular::{Limits, Values, open};
-use support::{Dataset, demo_contract, demo_log, files, last_at, run, shared};
+use support::{Dataset, demo_contract, demo_log, files, last_at, run, shared, suggest};
 
 /// The flag in force is a column of its own; an operator who says nothing yet has not intervened, and that is not known.
 const CONTRACT: &str = r#"
@@ -81,6 +81,12 @@ fn a_bag_that_was_compressed_as_a_whole_is_read() {
         files(dir).into_iter().filter(|(path, _)| path.starts_with("data")).map(|(_, bytes)| bytes).collect()
     };
     assert!(data(&plain) == data(&packed), "the same rows, to the byte");
+    let contracts = [("plain.toml", demo_log()), ("packed.toml", bag.clone())].map(|(name, input)| {
+        let contract = folder.path().join(name);
+        suggest(&[&input], &contract);
+        std::fs::read_to_string(contract).unwrap()
+    });
+    assert_eq!(contracts[0], contracts[1], "suggested from the log and from the packed one");
 
     // Half of the file: what cannot be unpacked is refused.
     let whole = std::fs::read(bag.join("demo_0.mcap.zstd")).unwrap();

@@ -43,6 +43,11 @@ pub(crate) trait RowRecording: Send + Sync {
     fn read_block(&self, block: &BlockRef) -> Block;
     /// Reads only these topics from now on.
     fn select(&mut self, topics: &[String]);
+    /// Says why what is in the file under the name of a topic is not offered as one, and what to do.
+    fn why_not_offered(&self, topic: &str) -> Option<(String, Option<&'static str>)> {
+        let _ = topic;
+        None
+    }
     /// Topics that are declared but have no values here, and why.
     fn unavailable(&self) -> &[Unavailable] {
         &[]

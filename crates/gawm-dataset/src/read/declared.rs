@@ -179,6 +179,9 @@ fn read_at<T>(
     }
 }
 
+/// How the file begins that git keeps in place of a large one.
+const GIT_LFS: [u8; 23] = *b"version https://git-lfs";
+
 /// Checks the schema in the footer of a file of `size` bytes: how many elements it declares, and how deep they are.
 pub(super) fn check_schema(file: &File, size: u64) -> Result<(), String> {
     let mut tail = [0; 8];
@@ -188,13 +191,20 @@ pub(super) fn check_schema(file: &File, size: u64) -> Result<(), String> {
         .seek(SeekFrom::Start(start))
         .and_then(|_| source.read_exact(&mut tail))
         .map_err(|e| e.to_string())?;
+    if &tail[4..] != b"PAR1" {
+        let mut head = [0; GIT_LFS.len()];
+        let read = source.seek(SeekFrom::Start(0)).and_then(|_| source.read_exact(&mut head));
+        return Err(match read {
+            Ok(()) if head == GIT_LFS => {
+                "a git LFS pointer in its place: `git lfs pull` fetches it".to_owned()
+            }
+            _ => "no Parquet footer at its end: it was cut, or is another format".to_owned(),
+        });
+    }
     let length = u64::from(u32::from_le_bytes([tail[0], tail[1], tail[2], tail[3]]));
     let Some(footer) = start.checked_sub(length) else {
         return Err(format!("a footer of {length} bytes in a file of {size}"));
     };
-    if &tail[4..] != b"PAR1" {
-        return Err("no Parquet footer at its end: it was cut, or is another format".to_owned());
-    }
     read_at(file, footer, length, MAX_SCHEMA_BYTES, parse_schema)
         .map(|_| ())
         .map_err(|e| format!("a footer with {e}"))

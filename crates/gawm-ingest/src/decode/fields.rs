@@ -1,5 +1,7 @@
 //! The fields of a channel as a list of leaves, for suggestions and errors.
 
+use std::borrow::Cow;
+
 use super::channel::{ChannelSchema, Encoding, SchemaLibrary};
 use super::error::{CompileError, DecodeError};
 use super::json::scan::Scan;
@@ -45,19 +47,21 @@ pub fn channel_fields(
     Ok(out)
 }
 
-/// Lists the leaves of a channel's type and, for JSON, those of one message that the schema does not declare.
+/// Lists the leaves of a channel's type and, for JSON and what is read as JSON (CBOR, FlatBuffers), those of one message that the schema does not declare.
 ///
 /// # Errors
-/// [`DecodeError`] if the channel cannot be decoded or the message is no JSON.
+/// [`DecodeError`] if the channel cannot be decoded or the message is damaged.
 pub fn sample_fields(
     channel: &ChannelSchema<'_>,
     payload: &[u8],
     library: &SchemaLibrary,
 ) -> Result<Vec<FieldInfo>, DecodeError> {
     let mut out = channel_fields(channel, library)?;
-    if library.types(channel)?.encoding == Encoding::Json {
+    let types = library.types(channel)?;
+    if types.encoding == Encoding::Json {
         let mut seen = Vec::new();
-        let mut scan = Scan::new(payload);
+        let payload = types.transcoder.as_ref().map_or(Ok(Cow::Borrowed(payload)), |t| t.apply(payload))?;
+        let mut scan = Scan::new(&payload);
         sample(&mut scan, &mut Vec::new(), &mut seen, 0)?;
         for field in seen {
             if !out.iter().any(|known| known.path == field.path) {

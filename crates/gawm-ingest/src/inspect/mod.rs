@@ -24,6 +24,7 @@ use crate::lerobot::{self, LerobotRecording};
 use crate::log::{
     Block, BlockKind, Channel, Damage, DamageKind, Log, OpenLogError, OpenOptions, discover, looks_like_zstd,
 };
+use crate::run::{OpenError, Source};
 use crate::tabular;
 use statistics::{ChannelStatistics, Digest};
 
@@ -58,9 +59,16 @@ pub fn inspect(inputs: &[PathBuf], options: &OpenOptions, probe: &dyn MessagePro
             if inspect_rows(part, &mut report) {
                 continue;
             }
-            match Log::open(part, options) {
-                Ok(log) => report.files.push(inspect_log(&log, part, probe)),
-                Err(error) => report.refused.push(refusal(&error)),
+            match Source::open_log(part, options) {
+                Ok(source) => {
+                    report.files.extend(source.as_log().map(|log| inspect_log(log, part, probe)));
+                }
+                Err(OpenError::Log(error)) => report.refused.push(refusal(&error)),
+                Err(error) => report.refused.push(Refusal {
+                    path: part.display().to_string(),
+                    error: error.to_string(),
+                    hint: error.hint(),
+                }),
             }
         }
     }

@@ -331,7 +331,7 @@ impl LerobotRecording {
     /// Checks once what the pages of the selected columns declare; returns how many rows a batch may have.
     fn check_row_group(
         &self,
-        file: usize,
+        (file, opened): (usize, &File),
         row_group: usize,
         metadata: &ParquetMetaData,
         mask: &ProjectionMask,
@@ -340,8 +340,7 @@ impl LerobotRecording {
         if let Some(most_rows) = checked.get(&(file, row_group)) {
             return Ok(*most_rows);
         }
-        let opened = File::open(&self.dataset.files[file].path).map_err(|error| error.to_string())?;
-        let most_rows = check_pages(&opened, metadata, [row_group], mask)?;
+        let most_rows = check_pages(opened, metadata, [row_group], mask)?;
         checked.insert((file, row_group), most_rows);
         Ok(most_rows)
     }
@@ -350,7 +349,8 @@ impl LerobotRecording {
         let run = self.dataset.runs[self.episodes[span.episode].run];
         let file = &self.dataset.files[run.file];
         let opened = File::open(&file.path).map_err(|error| error.to_string())?;
-        let builder = ParquetRecordBatchReaderBuilder::try_new(opened).map_err(|error| error.to_string())?;
+        let shared = opened.try_clone().map_err(|error| error.to_string())?;
+        let builder = ParquetRecordBatchReaderBuilder::try_new(shared).map_err(|error| error.to_string())?;
         let schema = Arc::clone(builder.schema());
         let columns: Vec<(usize, &Arc<Channel>)> = self
             .channels
@@ -359,7 +359,8 @@ impl LerobotRecording {
             .filter_map(|channel| Some((schema.index_of(&channel.topic).ok()?, channel)))
             .collect();
         let mask = ProjectionMask::roots(builder.parquet_schema(), columns.iter().map(|(index, _)| *index));
-        let most_rows = self.check_row_group(run.file, span.row_group, builder.metadata(), &mask)?;
+        let most_rows =
+            self.check_row_group((run.file, &opened), span.row_group, builder.metadata(), &mask)?;
         let n_rows = usize::try_from(span.rows.end - span.rows.start).map_err(|error| error.to_string())?;
         let offset = usize::try_from(span.offset).map_err(|error| error.to_string())?;
         let reader = builder
@@ -417,7 +418,7 @@ fn off_grid(episode: i64, largest: f64, fps: f64) -> Option<Damage> {
         kind: DamageKind::IndexMismatch,
         offset: 0,
         detail: format!(
-            "episode {episode}: timestamp is up to {largest:.3} s from frame_index / fps; rows keep the grid"
+            "episode {episode}: timestamp is up to {largest:.3} s from frame_index / fps; rows keep the grid, frames of videos follow timestamp"
         ),
     })
 }

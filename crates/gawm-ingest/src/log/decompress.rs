@@ -133,10 +133,11 @@ pub fn decompress_message(payload: &[u8], limit: u64) -> Result<Vec<u8>, ReadErr
     let bad = |reason: String| ReadError::Decompress { reason };
     let too_large = |size| ReadError::TooLarge { what: "message body", size, limit };
     let stated = zstd::zstd_safe::get_frame_content_size(payload).ok().flatten();
-    if let Some(size) =
-        stated.filter(|&size| size > limit || size_refusal(payload.len() as u64, size, limit).is_some())
-    {
+    if let Some(size) = stated.filter(|&size| size > limit) {
         return Err(too_large(size));
+    }
+    if let Some(refusal) = stated.and_then(|size| size_refusal(payload.len() as u64, size, limit)) {
+        return Err(bad(refusal));
     }
     let mut data = Vec::new();
     let decoder =

@@ -177,6 +177,18 @@ pub enum Refusal {
         /// Topics of the log.
         topics: Vec<String>,
     },
+    /// A required column is in the file and cannot be used.
+    #[error("column {topic:?}, which stream {stream:?} requires, cannot be used: {why}")]
+    UnusableColumn {
+        /// Name of the stream.
+        stream: String,
+        /// The column.
+        topic: String,
+        /// Why.
+        why: String,
+        /// What to do about it.
+        hint: Option<&'static str>,
+    },
     /// The schema of a required topic cannot be used: the log's fault, not the contract's.
     #[error("stream {stream:?} cannot be decoded: {source}")]
     Undecodable {
@@ -269,6 +281,9 @@ impl Refusal {
             Refusal::Open(error) => error.hint(),
             Refusal::MissingTopic { .. } => {
                 Some("correct the topic, or remove the stream from the contract if this log cannot have it".to_owned())
+            }
+            Refusal::UnusableColumn { hint, .. } => {
+                Some(hint.unwrap_or("remove the stream from the contract if this file cannot have it").to_owned())
             }
             Refusal::EmptyStream { .. } => {
                 Some("gap = \"mask\" makes a stream of numbers optional; `gawm-ingest inspect LOG` shows the topic".to_owned())

@@ -41,7 +41,7 @@ pub(crate) use publishers::split as split_by_publisher;
 pub(crate) use recording::OpenRecording;
 pub use report::{FileReport, FileStatus, LostReport, Report, StreamReport, TopicReport};
 pub(crate) use session::defect_of;
-pub(crate) use source::Source;
+pub(crate) use source::{OpenError, Source};
 
 use crate::contract::{CheckedContract, to_toml};
 use crate::decode::SchemaLibrary;
@@ -194,6 +194,7 @@ impl Run<'_> {
             Ok(binding) => binding,
             Err(BindError::Run(error)) => return Err(error),
             Err(BindError::Refused(refusal)) => {
+                let refusal = unavailable::explain(refusal, &open);
                 return Ok(FileReport::refused(&path, with_hint(&refusal.to_string(), refusal.hint())));
             }
         };

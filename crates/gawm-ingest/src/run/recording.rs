@@ -361,7 +361,7 @@ fn outcome(
             .iter()
             .map(|found| format!("{} at offset {}: {}", found.kind.as_str(), found.offset, found.detail)),
     );
-    warnings.extend(gaps::describe(context.binding, &result.gaps, first_ns(open)));
+    warnings.extend(gaps::describe(context.binding, &result.gaps, first_ns(open), open.has_episodes()));
     if result.failed_pictures > 0 {
         warnings.push(format!(
             "{} images turned out to be damaged when they were converted; their rows hold the image before, not valid",

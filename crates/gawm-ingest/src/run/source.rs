@@ -9,7 +9,9 @@ use super::open_options;
 use super::unpack::{UnpackError, is_packed, unpack};
 use crate::contract::{CheckedContract, TickRule};
 use crate::lerobot::{self, LerobotError, LerobotRecording};
-use crate::log::{Block, BlockRef, Channel, Damage, Log, MetadataRecord, OpenLogError, SummaryCounts};
+use crate::log::{
+    Block, BlockRef, Channel, Damage, Log, MetadataRecord, OpenLogError, OpenOptions, SummaryCounts,
+};
 use crate::rows::{RowRecording, Unavailable};
 use crate::tabular::{Limits, OpenTableError, RecordingError, TableRecording, open, sniff};
 
@@ -43,6 +45,14 @@ pub(crate) enum OpenError {
     /// It is a compressed log that cannot be unpacked.
     #[error(transparent)]
     Unpack(#[from] UnpackError),
+    /// What it was unpacked into is no readable log.
+    #[error("{path:?}, unpacked: {source}")]
+    Packed {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with its content.
+        source: OpenLogError,
+    },
     /// It is a LeRobot folder that cannot be read.
     #[error(transparent)]
     Lerobot(#[from] LerobotError),
@@ -72,9 +82,13 @@ impl OpenError {
             OpenError::Recording { source: RecordingError::Layout(error), .. } => {
                 error.hint().map(ToOwned::to_owned)
             }
+            OpenError::Unpack(UnpackError::Read { .. }) => {
+                Some("it was cut or damaged: copy it again from the robot".to_owned())
+            }
             OpenError::Unpack(_) => {
                 Some("unpack it yourself (zstd -d), or set TMPDIR to a folder with room".to_owned())
             }
+            OpenError::Packed { source, .. } => source.hint(),
             OpenError::Recording { .. } => None,
             OpenError::NoRate { .. } => Some(
                 "HDF5 and npz files hold no times; write `[ticks]` with `mode = \"native\"` and `fps = ...`"
@@ -104,12 +118,18 @@ impl Source {
                 .map_err(|source| OpenError::Recording { path: path.to_owned(), source })?;
             return Ok(Source::Rows(Box::new(recording)));
         }
-        if is_packed(path) {
-            let unpacked = unpack(path)?;
-            let log = Box::new(Log::open(unpacked.path(), &open_options(contract))?);
-            return Ok(Source::Packed { path: path.to_owned(), log, _unpacked: unpacked });
+        Source::open_log(path, &open_options(contract))
+    }
+
+    /// Opens an MCAP file, compressed as a whole or not.
+    pub(crate) fn open_log(path: &Path, options: &OpenOptions) -> Result<Source, OpenError> {
+        if !is_packed(path) {
+            return Ok(Source::Log(Box::new(Log::open(path, options)?)));
         }
-        Ok(Source::Log(Box::new(Log::open(path, &open_options(contract))?)))
+        let unpacked = unpack(path)?;
+        let log = Log::open(unpacked.path(), options)
+            .map_err(|source| OpenError::Packed { path: path.to_owned(), source })?;
+        Ok(Source::Packed { path: path.to_owned(), log: Box::new(log), _unpacked: unpacked })
     }
 
     /// Returns the MCAP file, if it is one.
@@ -208,6 +228,14 @@ impl Source {
     /// Returns whether the file lists its episodes itself.
     pub(crate) fn has_episodes(&self) -> bool {
         matches!(self, Source::Rows(_))
+    }
+
+    /// Says why what is in the file under the name of a topic is not offered as one, and what to do.
+    pub(crate) fn why_not_offered(&self, topic: &str) -> Option<(String, Option<&'static str>)> {
+        match self {
+            Source::Log(_) | Source::Packed { .. } => None,
+            Source::Rows(rows) => rows.why_not_offered(topic),
+        }
     }
 
     /// Returns the topics that are declared and have no values.

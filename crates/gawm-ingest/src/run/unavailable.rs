@@ -1,5 +1,6 @@
 //! Topics that a source declares and has no values of: their streams are left out, and that is a loss.
 
+use super::error::Refusal;
 use super::recording::OpenRecording;
 use super::report::{FileReport, FileStatus, LostReport, Report, TopicReport};
 use crate::contract::{CheckedContract, TickRule};
@@ -41,6 +42,15 @@ pub(crate) fn reduce(contract: &CheckedContract, open: &OpenRecording) -> Option
         reduced.lost_ticks = Some(stream.clone());
     }
     (!reduced.left_out.is_empty()).then_some(reduced)
+}
+
+/// Says of a topic that is missing why, where the file holds it in a form that cannot be used.
+pub(crate) fn explain(refusal: Refusal, open: &OpenRecording) -> Refusal {
+    let Refusal::MissingTopic { stream, topic, topics } = refusal else { return refusal };
+    match open.logs.iter().find_map(|log| log.why_not_offered(&topic)) {
+        Some((why, hint)) => Refusal::UnusableColumn { stream, topic, why, hint },
+        None => Refusal::MissingTopic { stream, topic, topics },
+    }
 }
 
 /// Says what was left out.

@@ -141,7 +141,8 @@ pub(crate) fn is_housekeeping(topic: &str, type_name: &str) -> bool {
             | "OccupancyGrid"
             | "PointCloud"
             | "PointCloud2"
-    ) || topic.ends_with("/clock")
+    ) || (type_name.contains("/srv/") && bare.ends_with("_Event"))
+        || topic.ends_with("/clock")
         || matches!(topic, "/rosout" | "/rosout_agg" | "/parameter_events" | "/tf" | "/tf_static")
 }
 

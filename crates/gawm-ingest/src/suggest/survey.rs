@@ -10,7 +10,7 @@ use bytes::Bytes;
 use super::SuggestError;
 use crate::decode::{DecodePlan, Decoded, FieldInfo, RowSink, SchemaLibrary, StampSource, sample_fields};
 use crate::inspect::{ChannelProbe, ChannelReport, MessageProbe, inspect_log};
-use crate::log::{Channel, Log, OpenOptions, decompress_message, discover, looks_like_zstd};
+use crate::log::{Channel, OpenOptions, decompress_message, discover, looks_like_zstd};
 use crate::run::{OpenRecording, Source, schema_of};
 
 /// Payloads that are kept per topic.
@@ -118,9 +118,10 @@ pub(crate) fn survey(
     let mut recordings = 0;
     let mut steps = Steps::default();
     for recording in &found.recordings {
-        let logs: Result<Vec<Log>, _> = recording.parts.iter().map(|path| Log::open(path, options)).collect();
-        let logs = match logs {
-            Ok(logs) => logs,
+        let sources: Result<Vec<Source>, _> =
+            recording.parts.iter().map(|path| Source::open_log(path, options)).collect();
+        let sources = match sources {
+            Ok(sources) => sources,
             Err(error) => {
                 hint = hint.or(error.hint());
                 reasons.push(error.to_string());
@@ -128,7 +129,6 @@ pub(crate) fn survey(
             }
         };
         recordings += 1;
-        let sources = logs.into_iter().map(|log| Source::Log(Box::new(log))).collect();
         let open = OpenRecording::of(recording.name.clone(), sources);
         let mut seen: BTreeMap<String, Topic> = BTreeMap::new();
         for log in open.logs.iter().filter_map(Source::as_log) {
@@ -224,9 +224,9 @@ fn collect_samples(open: &OpenRecording, topics: &mut BTreeMap<String, Topic>, l
         }
     }
     for topic in topics.values_mut() {
-        if let Some(sample) = topic.samples.first() {
-            topic.fields = sample_fields(&schema_of(&topic.channel), sample, library).unwrap_or_default();
-        }
+        let schema = schema_of(&topic.channel);
+        let mut found = topic.samples.iter().map(|sample| sample_fields(&schema, sample, library));
+        topic.fields = found.find_map(Result::ok).unwrap_or_default();
     }
 }
 

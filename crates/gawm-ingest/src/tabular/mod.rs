@@ -35,6 +35,7 @@ pub use column::{Attribute, AttributeValue, Column, Dtype, Filter, Rows, Values}
 pub use error::{OpenTableError, ReadError};
 pub use finding::{Finding, FindingKind};
 pub use layout::{ColumnRows, Episode, EpisodeEnd, Episodes, Extent, Layout, LayoutError};
+pub(crate) use raw::f32_from_f16;
 use raw::{RawForm, RawType};
 pub use recording::{RecordingError, TableRecording};
 pub use report::{ColumnReport, TableReport, report};

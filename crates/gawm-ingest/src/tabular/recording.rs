@@ -285,6 +285,24 @@ impl RowRecording for TableRecording {
         out
     }
 
+    fn why_not_offered(&self, topic: &str) -> Option<(String, Option<&'static str>)> {
+        let is_it = |path: &str| {
+            path.strip_suffix(topic).is_some_and(|before| before.is_empty() || before.ends_with('/'))
+        };
+        let unreadable = self.table.columns().iter().filter(|column| is_it(&column.path));
+        if let Some(problem) = unreadable.filter_map(|column| column.problem.as_ref()).next() {
+            return Some((problem.to_string(), problem.hint()));
+        }
+        if let Some(finding) = self.findings().find(|finding| is_it(&finding.place)) {
+            return Some((format!("{}: {}", finding.place, finding.detail), None));
+        }
+        let of_episode = self.found.episodes.iter().find_map(|episode| episode.columns.get(topic));
+        let rows = of_episode.map(|at| at.rows).or_else(|| {
+            self.table.columns().iter().find(|column| is_it(&column.path)).and_then(Column::rows)
+        })?;
+        Some((format!("it has {rows} rows, which are not those of the episodes"), None))
+    }
+
     fn select(&mut self, topics: &[String]) {
         self.selected = topics.iter().cloned().collect();
         self.list_blocks();

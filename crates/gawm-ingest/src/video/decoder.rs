@@ -51,6 +51,10 @@ impl Decoder {
         let mut options = ffmpeg::Dictionary::new();
         options.set("threads", "1");
         options.set("max_pixels", &Limits::default().max_pixels.to_string());
+        if matches!(id, Id::H264 | Id::HEVC) {
+            // A picture that is damaged is an error, not one that is painted over with its neighbours.
+            options.set("err_detect", "explode");
+        }
         let opened = context.decoder().open_as_with(codec, options).and_then(|opened| opened.video());
         let opened = opened.map_err(|error| VideoError::Packet { detail: error.to_string() })?;
         Ok(Decoder { opened, is_drained: false })

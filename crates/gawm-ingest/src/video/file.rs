@@ -1,6 +1,7 @@
 //! Frames of one MP4 file, by time, in one pass.
 
 use std::collections::VecDeque;
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use ffmpeg_next as ffmpeg;
@@ -33,8 +34,17 @@ pub(super) struct VideoFile {
     is_ended: bool,
     /// Frames before this time belong to what lies before the place that was sought.
     not_before: Option<i64>,
+    /// Whether a packet was damaged: what follows may refer to it, up to the next keyframe.
+    waits_for_key: bool,
     /// What the decoder complained of since the last frame.
     complaint: Option<String>,
+}
+
+/// Whether git has put a pointer in place of a large file.
+fn is_git_lfs_pointer(path: &Path) -> bool {
+    const BEGINNING: &[u8] = b"version https://git-lfs";
+    let mut head = [0; BEGINNING.len()];
+    std::fs::File::open(path).and_then(|mut file| file.read_exact(&mut head)).is_ok() && head == BEGINNING
 }
 
 impl VideoFile {
@@ -48,8 +58,13 @@ impl VideoFile {
         options.set("protocol_whitelist", "file");
         options.set("format_whitelist", "mov,mp4,m4a,3gp,3g2,mj2");
         options.set("codec_whitelist", "h264,hevc,libdav1d,av1,vp9");
-        let input = ffmpeg::format::input_with_dictionary(&format!("file:{text}"), options)
-            .map_err(|error| failed(error.to_string()))?;
+        let input =
+            ffmpeg::format::input_with_dictionary(&format!("file:{text}"), options).map_err(|error| {
+                match is_git_lfs_pointer(path) {
+                    true => failed("it is a git LFS pointer, `git lfs pull` fetches the video".to_owned()),
+                    false => failed(error.to_string()),
+                }
+            })?;
         let found = input.streams().best(Type::Video);
         let found = found.ok_or_else(|| failed("it has no video stream".to_owned()))?;
         let (stream, base) = (found.index(), found.time_base());
@@ -71,6 +86,7 @@ impl VideoFile {
             passed_secs: None,
             is_ended: false,
             not_before: None,
+            waits_for_key: false,
             complaint: None,
         })
     }
@@ -145,6 +161,7 @@ impl VideoFile {
             self.decoder.flush();
             self.ready.clear();
             (self.passed_secs, self.is_ended, self.not_before) = (None, false, None);
+            self.waits_for_key = false;
             if sought.is_err() && target_secs > 0.0 {
                 continue;
             }
@@ -190,37 +207,68 @@ impl VideoFile {
     /// Decodes one packet of the file, or what is left at its end.
     fn decode_next(&mut self) {
         let mut packet = Packet::empty();
-        let (ready, not_before) = (&mut self.ready, self.not_before);
-        let mut take = |frame: RawFrame| {
-            if not_before.is_none_or(|first| frame.pts.is_some_and(|pts| pts >= first)) {
-                ready.push_back(frame);
-            }
-        };
         match packet.read(&mut self.input) {
             Ok(()) if packet.stream() != self.stream => {}
             Ok(()) if packet.size() > MAX_PACKET_BYTES => {
                 self.complaint = Some(format!("a packet of {} bytes", packet.size()));
             }
-            Ok(()) => {
-                if packet.is_corrupt() {
-                    self.complaint = Some("the file is cut off within a frame".to_owned());
-                }
-                match self.decoder.send(&packet, &mut take) {
-                    Ok(()) => {}
-                    Err(error) => self.complaint = Some(error.to_string()),
-                }
-                if self.not_before.is_none() {
-                    self.not_before = packet.pts();
-                }
-            }
+            Ok(()) if self.waits_for_key && !packet.is_key() => {}
+            Ok(()) => self.decode(&packet),
             Err(error) => {
                 if error != ffmpeg::Error::Eof {
                     self.complaint = Some(error.to_string());
                 }
-                self.decoder.drain(&mut take);
+                self.drain(None);
                 self.is_ended = true;
             }
         }
+    }
+
+    fn decode(&mut self, packet: &Packet) {
+        if packet.is_corrupt() {
+            self.complaint = Some("the file is cut off within a frame".to_owned());
+        }
+        if self.waits_for_key {
+            (self.waits_for_key, self.not_before) = (false, packet.pts());
+        }
+        let (mut frames, not_before) = (Vec::new(), self.not_before);
+        let sent = self.decoder.send(packet, |frame| frames.push(frame));
+        frames.retain(|frame| not_before.is_none_or(|first| frame.pts.is_some_and(|pts| pts >= first)));
+        let damaged = frames.iter().position(RawFrame::is_damaged);
+        let first = match (sent, damaged) {
+            (Ok(()), None) => None,
+            (Ok(()), Some(at)) => {
+                self.complaint = Some("what a frame refers to is missing".to_owned());
+                frames[at].pts
+            }
+            (Err(error), _) => {
+                self.complaint = Some(error.to_string());
+                packet.pts()
+            }
+        };
+        let is_good =
+            |frame: &RawFrame| !frame.is_damaged() && first.is_none_or(|first| frame.pts < Some(first));
+        self.ready.extend(frames.into_iter().filter(is_good));
+        if first.is_some() {
+            // Earlier frames that the decoder still holds are good; what follows may refer to this one.
+            self.drain(first);
+            self.decoder.flush();
+            self.waits_for_key = true;
+        }
+        if self.not_before.is_none() {
+            self.not_before = packet.pts();
+        }
+    }
+
+    /// Takes the frames that the decoder still holds, those before a time only if it is given.
+    fn drain(&mut self, before: Option<i64>) {
+        let (ready, not_before) = (&mut self.ready, self.not_before);
+        self.decoder.drain(|frame| {
+            let is_late = before.is_some_and(|before| frame.is_damaged() || frame.pts >= Some(before));
+            if !is_late && not_before.is_none_or(|first| frame.pts.is_some_and(|pts| pts >= first)) {
+                ready.push_back(frame);
+            }
+        });
     }
 }
 

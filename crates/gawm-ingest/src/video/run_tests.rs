@@ -7,9 +7,12 @@ use base64::Engine as _;
 use gawm_dataset::read::{Dataset, FrameBytes, ReadLimits};
 
 use super::tests::{fixture, number_of, packets};
+use crate::decode::SchemaLibrary;
+use crate::log::OpenOptions;
 use crate::rows::{push_bytes, push_header, push_text};
 use crate::run::made_logs::{LogWriter, run_over};
 use crate::run::{FileStatus, RunOutcome};
+use crate::suggest::{suggest, to_toml};
 
 const CAMERA: &str = "observation.images.cam";
 
@@ -43,6 +46,16 @@ enum Encoding {
 
 /// Writes a log of 30 frames at 10 Hz and returns its path.
 fn log(folder: &Path, encoding: Encoding, keeps: impl Fn(usize) -> bool) -> std::path::PathBuf {
+    log_of(folder, encoding, keeps, |_, packet| packet.to_vec())
+}
+
+/// The same with what `change` makes of each packet.
+fn log_of(
+    folder: &Path,
+    encoding: Encoding,
+    keeps: impl Fn(usize) -> bool,
+    change: impl Fn(usize, &[u8]) -> Vec<u8>,
+) -> std::path::PathBuf {
     let mut log = LogWriter::new(folder);
     let ros = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n================================================================================\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
     let json = r#"{"title": "foxglove.CompressedVideo", "type": "object", "properties": {
@@ -57,6 +70,7 @@ fn log(folder: &Path, encoding: Encoding, keeps: impl Fn(usize) -> bool) -> std:
         }
     }
     for (number, packet) in packets().iter().enumerate() {
+        let packet = &change(number, packet);
         let time_ms = number as u64 * 100;
         log.write("/state", time_ms, format!("{{\"x\": {number}}}").as_bytes());
         if !keeps(number) {
@@ -108,6 +122,26 @@ fn packets_before_the_first_keyframe_are_counted() {
     assert_eq!(outcome.report.files[0].status, FileStatus::Loss);
     assert_eq!(lost(&outcome, "/video"), [("before_keyframe".to_owned(), 7)]);
     assert_eq!(numbers(&out), (20..30).collect::<Vec<_>>());
+}
+
+#[test]
+fn a_packet_that_is_cut_is_lost_with_what_refers_to_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = log_of(
+        dir.path(),
+        Encoding::Cdr,
+        |_| true,
+        |number, packet| match number {
+            14 => packet[..packet.len() / 2].to_vec(),
+            _ => packet.to_vec(),
+        },
+    );
+    let out = dir.path().join("out");
+    let outcome = run_over(LOG_CONTRACT, &path, &out, 1).unwrap();
+    assert_eq!(outcome.report.files[0].status, FileStatus::Loss);
+    let n_lost: u64 = lost(&outcome, "/video").iter().map(|(_, count)| count).sum();
+    assert_eq!(n_lost, 6, "{:?}", lost(&outcome, "/video"));
+    assert_eq!(numbers(&out), (0..14).chain(20..30).collect::<Vec<_>>());
 }
 
 #[test]
@@ -174,6 +208,19 @@ fn videos_of_a_folder_are_cameras() {
         files.push(fs::read(out.join("data/chunk-000/file-000.parquet")).unwrap());
     }
     assert!(files[0] == files[1], "the bytes depend on the number of jobs");
+}
+
+#[test]
+fn a_suggested_contract_maps_videos() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = folder(dir.path(), ["h264.mp4", "av1.mp4"]);
+    let inputs = [root.clone()];
+    let suggestion = suggest(&inputs, &SchemaLibrary::builtin(), &OpenOptions::default()).unwrap();
+    let text = to_toml(&suggestion);
+    let out = dir.path().join("out");
+    let outcome = run_over(&text, &root, &out, 2).unwrap();
+    assert_eq!(outcome.report.files[0].status, FileStatus::Ok, "{:#?}", outcome.report);
+    assert_eq!(numbers(&out), (0..30).chain(0..20).collect::<Vec<_>>(), "{text}");
 }
 
 #[test]

@@ -157,8 +157,8 @@ impl SimConfig {
 
     /// Checks ranges and returns the options of a collection.
     pub(super) fn options(&self, jobs: usize) -> Result<CollectOptions, SimConfigError> {
-        let need = |key, value: Option<u64>| {
-            value.ok_or(SimConfigError::Value { key, expected: "a number", got: "nothing".to_owned() })
+        let need = |key, expected, value: Option<u64>| {
+            value.ok_or(SimConfigError::Value { key, expected, got: "nothing".to_owned() })
         };
         let check = |key, is_good: bool, expected, got: String| match is_good {
             true => Ok(()),
@@ -181,8 +181,8 @@ impl SimConfig {
         Ok(CollectOptions {
             room: self.room.clone(),
             expert: ExpertConfig { action_noise: noise, action_repeat: repeat, door_reach_px: reach },
-            episodes: need("episodes", self.episodes)?,
-            seed: need("seed", self.seed)?,
+            episodes: need("episodes", "a number (--episodes N)", self.episodes)?,
+            seed: need("seed", "a number (--seed N)", self.seed)?,
             max_steps: self.max_steps,
             episodes_per_file: self.episodes_per_file,
             jobs,
@@ -222,7 +222,7 @@ mod tests {
 
     #[test]
     fn unusable_values_name_their_key() {
-        check_refused(&["episodes=1"], "seed: expected a number, got nothing");
+        check_refused(&["episodes=1"], "seed: expected a number (--seed N), got nothing");
         check_refused(&["episodes=1", "seed=1", "quality=0"], "quality: expected 1 to 100, got 0");
         check_refused(&["action_noise=nan", "episodes=1", "seed=1"], "action_noise");
         check_refused(&["sede=1"], "unknown field `sede`");

@@ -196,11 +196,20 @@ fn hint(error: &CollectError) -> Option<&'static str> {
         CollectError::Interrupted => {
             Some("logs that are complete stay; remove the folder and run again for all")
         }
-        CollectError::Io { source, .. } if source.kind() == std::io::ErrorKind::StorageFull => {
+        error if is_disk_full(error) => {
             Some("logs that are complete are usable; free space, remove the folder and run again")
         }
         _ => None,
     }
+}
+
+/// Whether there was no space left, at the bottom of an error.
+fn is_disk_full(error: &CollectError) -> bool {
+    let mut causes = std::iter::successors(Some(error as &dyn std::error::Error), |error| error.source());
+    causes.any(|cause| {
+        let io = cause.downcast_ref::<std::io::Error>();
+        io.is_some_and(|io| io.kind() == std::io::ErrorKind::StorageFull)
+    })
 }
 
 fn is_usage(error: &CollectError) -> bool {
@@ -316,4 +325,20 @@ fn measure_us(
         call(room, i as usize)?;
     }
     Ok(start.elapsed().as_secs_f64() * 1e6 / n as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_full_disk_is_seen_through_the_writer_of_logs() {
+        let error = |kind: std::io::ErrorKind| CollectError::Mcap {
+            path: PathBuf::from("a.mcap"),
+            source: mcap::McapError::Io(kind.into()),
+        };
+        let text = hint(&error(std::io::ErrorKind::StorageFull)).unwrap_or_default();
+        assert!(text.contains("free space"), "{text}");
+        assert_eq!(hint(&error(std::io::ErrorKind::NotFound)), None);
+    }
 }

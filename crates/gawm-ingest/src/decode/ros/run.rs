@@ -60,6 +60,8 @@ pub(crate) fn open_cdr(payload: &[u8]) -> Result<(&[u8], bool), DecodeError> {
         0x000a => "PL_CDR2_BE",
         0x000b => "PL_CDR2_LE",
         0x0004 => "XML",
+        0x0422 => "an LZ4 frame; compressed bodies are unpacked only if zstd compressed them",
+        0x1f8b => "gzip; compressed bodies are unpacked only if zstd compressed them",
         0x7b00..=0x7bff => "JSON text; the channel is labelled wrongly",
         _ => "unknown",
     };
@@ -104,12 +106,19 @@ fn whole<'a, const ALIGN: bool, const BIG: bool, E: Emit<'a>>(
 pub(crate) fn check_end<const ALIGN: bool, const BIG: bool>(
     reader: &Reader<'_, ALIGN, BIG>,
 ) -> Result<(), DecodeError> {
-    check_rest(reader.rest(), reader.offset())
+    // ROS 1 pads nothing.
+    let most = if ALIGN { MAX_PADDING } else { 0 };
+    check_surplus(reader.rest(), reader.offset(), most)
 }
 
 /// Refuses what is left of a message from `offset` on, unless it is padding.
 pub(crate) fn check_rest(rest: &[u8], offset: usize) -> Result<(), DecodeError> {
-    if rest.len() > MAX_PADDING && rest.iter().any(|b| *b != 0) {
+    check_surplus(rest, offset, MAX_PADDING)
+}
+
+/// Refuses more than `most` bytes, unless all are zeros.
+fn check_surplus(rest: &[u8], offset: usize, most: usize) -> Result<(), DecodeError> {
+    if rest.len() > most && rest.iter().any(|b| *b != 0) {
         return Err(DecodeError::TrailingBytes { offset, surplus: rest.len() });
     }
     Ok(())

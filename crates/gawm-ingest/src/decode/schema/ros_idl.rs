@@ -1,6 +1,7 @@
 //! Parser of OMG IDL as ROS 2 writes it (`ros2idl`, `omgidl`): structs, enums, typedefs and constants in modules.
 
 use std::collections::BTreeMap;
+use std::fmt;
 
 use super::ros_library::Library;
 use super::ros_msg::{Dialect, Fault, library_type};
@@ -49,6 +50,18 @@ enum Token {
     Mark(char),
     /// `::`
     Scope,
+}
+
+impl fmt::Display for Token {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Word(word) => f.write_str(word),
+            Self::Number(number) => number.fmt(f),
+            Self::Literal => f.write_str("a literal"),
+            Self::Mark(mark) => mark.fmt(f),
+            Self::Scope => f.write_str("::"),
+        }
+    }
 }
 
 /// A token and its line.
@@ -173,9 +186,10 @@ struct Parser {
 
 impl Parser {
     fn fault(&self, expected: &'static str) -> Fault {
-        let (text, line) = match self.tokens.get(self.at).or(self.tokens.last()) {
-            Some((token, line)) => (format!("{token:?}"), *line),
-            None => (String::new(), 0),
+        let (text, line) = match (self.tokens.get(self.at), self.tokens.last()) {
+            (Some((token, line)), _) => (token.to_string(), *line),
+            (None, Some((_, line))) => ("the end of the text".to_owned(), *line),
+            (None, None) => ("an empty text".to_owned(), 0),
         };
         Fault::Line { line, text: text.chars().take(80).collect(), expected }
     }

@@ -6,7 +6,7 @@ use rand_chacha::rand_core::{RngCore, SeedableRng};
 
 use crate::decode::{
     ChannelSchema, DecodePlan, FieldPath, ImagePlan, RowSink, SchemaLibrary, Value, channel_fields,
-    decode_to_json,
+    decode_to_json, sample_fields,
 };
 
 /// A channel, one message, and values at paths.
@@ -198,6 +198,57 @@ fn what_follows_a_message_is_padding_or_refused() {
 }
 
 #[test]
+fn leaves_of_a_sample_are_listed_in_what_is_read_as_json() {
+    let library = SchemaLibrary::builtin();
+    let cbor = b"\xa2\x61a\xa1\x61b\x82\x01\x02\x61t\x61x";
+    let channel = ChannelSchema { topic: "/t", message_encoding: "cbor", ..ChannelSchema::default() };
+    let fields = sample_fields(&channel, cbor, &library).unwrap();
+    let list: Vec<&str> = fields.iter().map(|field| field.path.as_str()).collect();
+    assert_eq!(list, ["a.b[]", "t"]);
+    let mut n_checked = 0;
+    for vector in vectors().iter().filter(|vector| vector.message_encoding == "flatbuffer") {
+        let fields = sample_fields(&vector.channel(&vector.schema), &vector.payload, &library);
+        assert!(fields.is_ok_and(|fields| fields.len() >= vector.paths().len()), "{}", vector.name);
+        n_checked += 1;
+    }
+    assert!(n_checked >= 1, "{n_checked}");
+}
+
+#[test]
+fn typed_arrays_of_cbor_are_arrays() {
+    let library = SchemaLibrary::builtin();
+    let channel = ChannelSchema { topic: "/t", message_encoding: "cbor", ..ChannelSchema::default() };
+    let check = |tag: u8, bytes: &[u8], expected: &str| {
+        let mut cbor = vec![0xa1, 0x61, b'x', 0xd8, tag, 0x40 + bytes.len() as u8];
+        cbor.extend_from_slice(bytes);
+        let got = match decode_to_json(&channel, &cbor, &library) {
+            Ok(value) => value.to_string(),
+            Err(error) => error.to_string(),
+        };
+        assert!(got.contains(expected), "tag {tag}: {got}");
+    };
+    check(86, &[1.5f64.to_le_bytes(), (-2.0f64).to_le_bytes()].concat(), "[1.5,-2.0]");
+    check(82, &0.1f64.to_be_bytes(), "[0.1]");
+    check(85, &0.5f32.to_le_bytes(), "[0.5]");
+    check(80, &[0x3c, 0x00, 0xc0, 0x00], "[1.0,-2.0]");
+    check(72, &[0xff, 1], "[-1,1]");
+    check(69, &[0xff, 0xfe], "[65279]");
+    check(73, &[0xff, 0xfe], "[-2]");
+    check(79, &(-3i64).to_le_bytes(), "[-3]");
+    check(67, &u64::MAX.to_be_bytes(), "[18446744073709551615]");
+    check(86, b"", "[]");
+    // Bytes stay bytes, as images are; reserved tags and those of 16-byte floats too.
+    check(64, &[1, 2, 3], "\"AQID\"");
+    check(68, &[1, 2, 3], "\"AQID\"");
+    check(76, &[1, 2, 3], "\"AQID\"");
+    check(87, &[0; 3], "\"AAAA\"");
+    check(86, &[0; 9], "expected whole numbers of 8 bytes, got 9 bytes");
+    // An item that ends early is named without the words of a library.
+    let error = decode_to_json(&channel, &[0xa1, 0x61, b'x', 0x43, 1], &library).unwrap_err().to_string();
+    assert!(error.contains("the message ends within an item"), "{error}");
+}
+
+#[test]
 fn labels_that_do_not_fit_are_named() {
     let library = SchemaLibrary::builtin();
     let check = |message_encoding, schema_encoding, schema_data: &[u8], payload: &[u8], expected: &str| {
@@ -217,8 +268,19 @@ fn labels_that_do_not_fit_are_named() {
     check("cdr", "jsonschema", b"{}", b"{\"a\": 1}", "{\"a\":1}");
     check("", "ros2msg", b"int32 a", &[0, 1, 0, 0, 5, 0, 0, 0], "{\"a\":5}");
     check("cdr", "ros2msg", b"int32 a", b"{\"a\": 1}", "labelled wrongly");
+    check("cdr", "ros2msg", b"int32 a", &[0x04, 0x22, 0x4d, 0x18, 0x60, 0x40], "LZ4");
     check("msgpack", "", b"", &[0x80], "not supported");
+    // ROS 1 pads nothing: what follows was written with another schema, or is CDR.
+    check("ros1", "ros1msg", b"int32 a", &[0, 1, 0, 0, 5, 0, 0, 0], "4 bytes follow");
     check("cdr", "ros2idl", b"module pkg { union", &[0, 1, 0, 0], "line 1");
+    check(
+        "cdr",
+        "ros2idl",
+        b"module pkg { struct A {\n double x",
+        &[0, 1, 0, 0],
+        "got \"the end of the text\"",
+    );
+    check("cdr", "ros2idl", b"module pkg { struct A { double x y", &[0, 1, 0, 0], "got \"y\"");
     check(
         "cdr",
         "ros2idl",

@@ -217,7 +217,11 @@ impl<'a> Walk<'a> {
 
     fn run(&mut self, path: &Path) -> Result<(), OpenTableError> {
         let root = self.parts.file.root_group();
-        let root = root.map_err(|e| OpenTableError::Hdf5 { path: path.to_owned(), detail: e.to_string() })?;
+        let root = root.map_err(|e| {
+            let cut = self.findings.iter().find(|finding| finding.kind == FindingKind::Truncated);
+            let detail = cut.map_or_else(|| e.to_string(), |cut| format!("{}; {e}", cut.detail));
+            OpenTableError::Hdf5 { path: path.to_owned(), detail }
+        })?;
         let links = links::list(&self.parts.file, root.address()).map_err(|e| OpenTableError::Hdf5 {
             path: path.to_owned(),
             detail: format!("root group: {e}"),
@@ -290,7 +294,7 @@ impl<'a> Walk<'a> {
             }
             (Err(_), Link::Soft(target)) => {
                 self.note(
-                    FindingKind::BrokenObject,
+                    FindingKind::UnreadableColumn,
                     place,
                     format!("is a soft link to {target:?}, which leads nowhere"),
                 );

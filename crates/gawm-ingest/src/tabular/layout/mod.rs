@@ -228,6 +228,9 @@ pub enum LayoutError {
     /// The file has no columns.
     #[error("the file has no arrays")]
     NoColumns,
+    /// All arrays are empty.
+    #[error("the arrays have no rows")]
+    NoRows,
     /// No layout fits.
     #[error(
         "no episode layout fits: expected flat, groups, suffixed, terminals or single, got the columns {columns}"
@@ -266,7 +269,7 @@ impl LayoutError {
             Self::Unknown { .. } => Some(
                 "state the layout in the contract, for example layout = { kind = \"single\", steps = \"actions\" }",
             ),
-            Self::NoColumns | Self::DoesNotFit { .. } | Self::TooMany { .. } => None,
+            Self::NoColumns | Self::NoRows | Self::DoesNotFit { .. } | Self::TooMany { .. } => None,
         }
     }
 }
@@ -278,6 +281,9 @@ pub(crate) fn episodes(table: &Table, stated: Option<&Layout>) -> Result<Episode
             Some(first) => LayoutError::NothingReadable { first },
             None => LayoutError::NoColumns,
         });
+    }
+    if readable(table).all(|column| column.rows() == Some(0)) {
+        return Err(LayoutError::NoRows);
     }
     let layout = match stated {
         Some(layout) => layout.clone(),

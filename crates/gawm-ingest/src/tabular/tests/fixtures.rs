@@ -139,12 +139,13 @@ fn what_is_foreign_is_refused_by_name() {
         assert!(matches!(table.read_all(path), Err(ReadError::UnsupportedType { .. })), "{path}");
     }
     let mut found = kinds(table.findings());
+    // Nobody can ask for what a link leads to in vain, so that it is no damage of the rest.
+    assert!(found.contains(&(FindingKind::UnreadableColumn, "link_to_nothing")));
     found.retain(|(kind, _)| *kind != FindingKind::UnreadableColumn);
     found.sort_unstable();
     assert_eq!(
         found,
         [
-            (FindingKind::BrokenObject, "link_to_nothing"),
             (FindingKind::GroupLinkedTwice, "loop/again"),
             (FindingKind::GroupLinkedTwice, "loop/self"),
             (FindingKind::ExternalLink, "link_out"),

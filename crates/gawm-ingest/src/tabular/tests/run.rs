@@ -72,6 +72,22 @@ fn a_table_without_a_rate_or_a_column_is_refused() {
 }
 
 #[test]
+fn a_column_that_cannot_be_used_is_refused_with_the_reason() {
+    let dir = tempfile::tempdir().unwrap();
+    let check = |column: &str, expected: &str| {
+        let contract = contract_of("mode = \"native\"\nfps = 10", column, "action");
+        let error = run_over(&contract, &dir.path().join("a"), &fixture("foreign.h5"), 1).unwrap_err();
+        assert!(error.to_string().contains(expected), "{column}: {error}");
+    };
+    check("zstd", "needs HDF5 filter 32015");
+    check("virtual", "virtual");
+    check("compound", "records");
+    check("link_out", "link");
+    check("link_to_nothing", "leads nowhere");
+    check("nothing", "no topic \"nothing\"");
+}
+
+#[test]
 fn published_recordings_keep_all_their_rows() {
     let Some(path) = corpus("swm_h5/tworoom.h5") else { return };
     let dir = tempfile::tempdir().unwrap();
