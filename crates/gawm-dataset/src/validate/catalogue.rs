@@ -333,6 +333,11 @@ pub const RULES: &[Rule] = &[
         "states follow their actions at another rate than in the other episodes",
         "look for rows that are missing or repeated throughout, or for another rate",
     ),
+    warning(
+        "SEMANTIC-016",
+        "a signal is not related to the others as in the other episodes",
+        "check time, sign, unit, zero and place of this dim in this episode, and of those it depends on",
+    ),
     warning("SPLIT-001", "two episodes are the same", "remove one of them"),
     warning(
         "SPLIT-002",
