@@ -1,10 +1,11 @@
-//! Layers from differentiable primitives: linear, layer norm, softmax, attention, GELU, SiLU, batch norm.
+//! Layers from differentiable primitives: layer norm, softmax, attention, GELU, SiLU, batch norm; and linear layers, which
+//! are candle's.
 //!
 //! candle's own `layer_norm`, `softmax_last_dim` and `Tensor::gelu` are fast and wrong for us: the first two have no
 //! backward pass and end the gradient without an error, the third is the tanh approximation. A test compares every
 //! function here with finite differences. Linear layers go through `gawm-kernels` where it takes them.
 
-use candle_core::{D, DType, Device, Tensor, Var};
+use candle_core::{D, DType, Device, Module as _, Tensor, Var};
 use gawm_kernels::GradientSink;
 
 use crate::Result;
@@ -14,8 +15,7 @@ use crate::pass::{Pass, Precision};
 /// `y = x W^T + b`.
 #[derive(Debug, Clone)]
 pub struct Linear {
-    weight: Tensor,
-    bias: Option<Tensor>,
+    layer: candle_nn::Linear,
     sink: GradientSink,
 }
 
@@ -38,38 +38,40 @@ impl Linear {
         let bias = format!("{name}.bias");
         let bias = if parameters.specs().contains_key(&bias) { Some(parameters.get(&bias)?) } else { None };
         let weight = parameters.get(&format!("{name}.weight"))?;
-        Ok(Linear { weight, bias, sink: parameters.sink().clone() })
+        Ok(Linear { layer: candle_nn::Linear::new(weight, bias), sink: parameters.sink().clone() })
     }
 
     /// Makes a layer of a weight [outputs, inputs] and a bias `[outputs]`.
     pub fn new(weight: Tensor, bias: Option<Tensor>) -> Linear {
-        Linear { weight, bias, sink: GradientSink::default() }
+        Linear { layer: candle_nn::Linear::new(weight, bias), sink: GradientSink::default() }
     }
 
     /// Width of the results.
     pub fn outputs(&self) -> Result<usize> {
-        self.weight.dim(0)
+        self.layer.weight().dim(0)
     }
 
     /// Maps the last axis: [.., inputs] to [.., outputs].
     pub fn forward(&self, x: &Tensor, pass: &Pass) -> Result<Tensor> {
-        let (outputs, inputs) = self.weight.dims2()?;
+        let (weight, bias) = (self.layer.weight(), self.layer.bias());
+        let (outputs, inputs) = weight.dims2()?;
         let mut dims = x.dims().to_vec();
         let rows = dims.iter().product::<usize>() / inputs;
         if let Some(last) = dims.last_mut() {
             *last = outputs;
         }
+        // One product over all rows: candle would copy the weight for every leading index of what is not contiguous.
         let x = x.reshape((rows, inputs))?;
-        let bias = self.bias.as_ref();
-        if pass.precision == Precision::F32 && gawm_kernels::linear::takes(&x, &self.weight, bias) {
-            return gawm_kernels::linear::linear(&x, &self.weight, bias, &self.sink)?.reshape(dims); // [.., outputs]
-        }
-        // One product over all rows: candle would copy the weight for every leading index otherwise.
-        let y = pass.matmul(&x, &self.weight.t()?)?; // [rows, outputs]
-        let y = match bias {
-            Some(bias) => y.broadcast_add(bias)?,
-            None => y,
-        };
+        let y = match pass.precision {
+            Precision::F32 if gawm_kernels::linear::takes(&x, weight, bias) => {
+                gawm_kernels::linear::linear(&x, weight, bias, &self.sink)?
+            }
+            Precision::F32 => self.layer.forward(&x)?,
+            Precision::Bf16 => match (pass.matmul(&x, &weight.t()?)?, bias) {
+                (y, Some(bias)) => y.broadcast_add(bias)?,
+                (y, None) => y,
+            },
+        }; // [rows, outputs]
         y.reshape(dims) // [.., outputs]
     }
 }
@@ -123,11 +125,6 @@ pub fn gelu(x: &Tensor) -> Result<Tensor> {
 /// Returns `x / (1 + exp(-x))`.
 pub fn silu(x: &Tensor) -> Result<Tensor> {
     x.silu()
-}
-
-/// Returns mean((a - b)^2) over all elements, a scalar.
-pub fn mean_squared_error(a: &Tensor, b: &Tensor) -> Result<Tensor> {
-    (a - b)?.sqr()?.mean_all()
 }
 
 /// Splits the last axis into heads: [N, T, heads x d] to [N, heads, T, d], contiguous.

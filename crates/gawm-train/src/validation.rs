@@ -2,7 +2,7 @@
 
 mod moments;
 
-use gawm_model::layers::mean_squared_error;
+use candle_nn::loss::mse;
 use gawm_model::{
     Clips, Control, Objectives, Pass, Stream, Tensor, Term, WorldModel, latent_losses, permutation,
 };
@@ -80,11 +80,11 @@ impl Validation {
         let predict = |actions: &Tensor| -> gawm_model::Result<f64> {
             let c = model.embed_actions(actions, &pass)?.narrow(1, 0, t - 1)?; // [B, T-1, D]
             let predicted = model.predict(&past, &c, &pass)?; // [B, T-1, D]
-            Ok(f64::from(mean_squared_error(&predicted, &next)?.to_scalar::<f32>()?))
+            Ok(f64::from(mse(&predicted, &next)?.to_scalar::<f32>()?))
         };
         self.prediction += weight * predict(&clips.actions)?;
         self.shuffled += weight * predict(&actions_of_others(&clips.actions, index)?)?;
-        self.identity += weight * f64::from(mean_squared_error(&past, &next)?.to_scalar::<f32>()?);
+        self.identity += weight * f64::from(mse(&past, &next)?.to_scalar::<f32>()?);
 
         self.latents.add(&z)?;
         self.add_heads(model, clips, &z, &pass)?;

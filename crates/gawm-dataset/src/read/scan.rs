@@ -115,11 +115,12 @@ impl Dataset {
         let keep = |index: usize, result: R| {
             results.lock().unwrap_or_else(std::sync::PoisonError::into_inner).push((index, result));
         };
-        rayon::scope(|scope| {
+        // First in, first out: who merges results in order then waits for few of them.
+        rayon::scope_fifo(|scope| {
             for (unit_index, unit) in units.iter().enumerate() {
                 let (process, keep, n_in_flight, defects) = (&process, &keep, &n_in_flight, &defects);
                 let is_wanted = &is_wanted;
-                scope.spawn(move |scope| {
+                scope.spawn_fifo(move |scope| {
                     let outcome = files::guarded(|| {
                         self.read_unit(unit, columns, |rows| {
                             let index = rows.run_index;
@@ -132,7 +133,7 @@ impl Dataset {
                                 return;
                             }
                             n_in_flight.fetch_add(1, Ordering::Relaxed);
-                            scope.spawn(move |_| {
+                            scope.spawn_fifo(move |_| {
                                 keep(index, process(rows));
                                 n_in_flight.fetch_sub(1, Ordering::Relaxed);
                             });

@@ -35,7 +35,8 @@ pub(super) fn judge(plan: &Plan, thresholds: &Thresholds, fps: f64, runs: &[RunP
         if profiles.is_empty() {
             continue;
         }
-        let judge = Judge { plan, thresholds, fps, feature, profiles: &profiles };
+        let mut judge = Judge { plan, thresholds, fps, feature, profiles: &profiles, ranges: Vec::new() };
+        judge.ranges = (0..layout.width()).map(|dim| judge.typical(dim, Signal::range)).collect();
         let groups = judge.groups(&mut findings);
         // Derived columns repeat what is said of the raw ones.
         if layout.purpose == Purpose::Encoded {
@@ -60,6 +61,8 @@ pub(super) struct Judge<'a> {
     pub(super) fps: f64,
     pub(super) feature: usize,
     pub(super) profiles: &'a [(&'a RunProfile, &'a FeatureProfile)],
+    /// Typical range of each dim.
+    ranges: Vec<f64>,
 }
 
 impl Judge<'_> {
@@ -83,9 +86,8 @@ impl Judge<'_> {
     fn is_idle(&self, dim: usize) -> bool {
         let layout = &self.plan.layouts[self.feature];
         let peers = (0..layout.width()).filter(|d| layout.units[*d] == layout.units[dim]);
-        let largest =
-            peers.map(|d| self.typical(d, Signal::range)).filter(|r| r.is_finite()).fold(0.0, f64::max);
-        self.typical(dim, Signal::range) < IDLE_SHARE * largest
+        let largest = peers.map(|d| self.ranges[d]).filter(|r| r.is_finite()).fold(0.0, f64::max);
+        self.ranges[dim] < IDLE_SHARE * largest
     }
 
     fn dim(&self, dim: usize, kind: DimKind, findings: &mut Vec<Finding>) {
@@ -155,7 +157,7 @@ impl Judge<'_> {
             return findings;
         }
         let usual = self.typical(dim, |s| s.rough99);
-        let range = self.typical(dim, Signal::range);
+        let range = self.ranges[dim];
         let floor = (bounds.jump_ratio * usual).max(bounds.jump_range_share * range);
         if usual <= 0.0 || floor <= 0.0 {
             return findings;
@@ -250,9 +252,10 @@ impl Judge<'_> {
         }
         let usual = self.typical(dim, |s| s.noise90);
         let step = self.typical(dim, |s| s.step);
+        let others = self.typical(dim, |s| s.rough50);
         for (run, signal) in self.signals(dim).filter(|(_, s)| !s.is_constant()) {
             let Some((window, level)) = signal.noisiest else { continue };
-            let (whole, others) = (signal.rough50, self.typical(dim, |s| s.rough50));
+            let whole = signal.rough50;
             if self.profiles.len() >= MIN_RUNS
                 && whole > 1.4 * bounds.noise_ratio * others
                 && whole > 0.1 * step
@@ -372,7 +375,7 @@ impl Judge<'_> {
         }
         let centres: Vec<f64> = self.signals(dim).map(|(_, s)| s.median).collect();
         let (centre, scale) = centre_and_scale(&centres);
-        let range = self.typical(dim, Signal::range);
+        let range = self.ranges[dim];
         for (run, signal) in self.signals(dim).filter(|(_, s)| s.n_finite > 0) {
             let distance = (signal.median - centre).abs();
             if distance > bounds.offset_sigmas * scale

@@ -9,9 +9,9 @@ mod straightening;
 mod table;
 
 use candle_core::{DType, Tensor};
+use candle_nn::loss::mse;
 
 use crate::Result;
-use crate::layers::mean_squared_error;
 use crate::model::WorldModel;
 use crate::pass::Pass;
 
@@ -98,12 +98,12 @@ pub fn latent_losses(
     let term = |term: Term| match term {
         Term::Prediction => {
             let predicted = model.predict(&past, &c.narrow(1, 0, t - 1)?, pass)?; // [B, T-1, D]
-            mean_squared_error(&predicted, &next)
+            mse(&predicted, &next)
         }
         Term::StateAlignment => {
             state_alignment(&model.read_states(z, pass)?, &clips.states, &clips.state_mask)
         }
-        Term::InverseDynamics => mean_squared_error(&model.read_actions(z, pass)?, &actions),
+        Term::InverseDynamics => mse(&model.read_actions(z, pass)?, &actions),
         Term::Sigreg => {
             let directions = sigreg_projections(z.dim(2)?, objectives.sigreg_projections, pass, z.device())?;
             sigreg(&z.transpose(0, 1)?, &directions)
@@ -112,7 +112,7 @@ pub fn latent_losses(
         Term::StdTime => standard_deviation(&centre(z)?.transpose(0, 1)?),
         Term::Covariance => covariance(&centre(z)?),
         Term::CovarianceTime => covariance(&centre(z)?.transpose(0, 1)?),
-        Term::TemporalAlignment => mean_squared_error(&past, &next),
+        Term::TemporalAlignment => mse(&past, &next),
         Term::Straightening => straightening(z),
     };
     objectives.evaluate(term, z.device())

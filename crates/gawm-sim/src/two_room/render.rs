@@ -6,6 +6,8 @@ use crate::exp::{ExpTable, LOWEST_ARGUMENT};
 
 /// Side of a frame in pixels.
 pub const FRAME_SIZE: usize = WORLD_SIZE_PX as usize;
+/// Values of a row of pixels.
+const ROW_VALUES: usize = FRAME_SIZE * 3;
 /// Thickness of the border's line.
 const BORDER_LINE_PX: usize = 4;
 /// A pixel whose exponent is this far below the largest has a weight under 2^-25: its blend rounds to what was there.
@@ -24,17 +26,19 @@ pub struct Renderer {
 }
 
 /// A Gaussian dot: its width and colour.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 struct Dot {
     /// Two variances.
     denominator: f32,
-    color: [u8; 3],
+    /// The colour of each pixel of a row. Shape [224, 3].
+    colors: [f32; ROW_VALUES],
 }
 
 impl Dot {
     fn new(radius_px: f32, color: [u8; 3]) -> Self {
         let std = f64::from(radius_px);
-        Dot { denominator: (2.0 * std * std) as f32, color }
+        let colors = std::array::from_fn(|i| f32::from(color[i % 3]));
+        Dot { denominator: (2.0 * std * std) as f32, colors }
     }
 }
 
@@ -53,10 +57,10 @@ impl Renderer {
         (frame.width, frame.height) = (FRAME_SIZE, FRAME_SIZE);
         frame.rgb.clear();
         frame.rgb.extend_from_slice(&self.rooms);
-        if let Some(dot) = self.target {
+        if let Some(dot) = &self.target {
             blend_dot(&mut frame.rgb, dot, target);
         }
-        blend_dot(&mut frame.rgb, self.agent, agent);
+        blend_dot(&mut frame.rgb, &self.agent, agent);
     }
 }
 
@@ -94,7 +98,7 @@ fn draw_rooms(config: &TwoRoomConfig) -> Vec<u8> {
 /// Blends a dot over an image of shape [224, 224, 3].
 ///
 /// The weight of a pixel is its Gaussian, divided by the largest of the image: a dot beyond the edge still shows.
-fn blend_dot(rgb: &mut [u8], dot: Dot, center: [f32; 2]) {
+fn blend_dot(rgb: &mut [u8], dot: &Dot, center: [f32; 2]) {
     let table = ExpTable::get();
     let squares =
         center.map(|c| std::array::from_fn::<f32, FRAME_SIZE, _>(|i| (i as f32 - c) * (i as f32 - c)));
@@ -107,6 +111,7 @@ fn blend_dot(rgb: &mut [u8], dot: Dot, center: [f32; 2]) {
     let peak = peak_weight(nearest, |x, y| table.exp(exponent(x, y)));
     let reach_squared = (VISIBLE_RANGE - largest_exponent) * dot.denominator;
     let mut weights = [0.0_f32; FRAME_SIZE];
+    let mut value_weights = [0.0_f32; ROW_VALUES];
     for y in pixels_within(center[1], reach_squared) {
         let columns = pixels_within(center[0], reach_squared - squares[1][y]);
         let weights = &mut weights[..columns.len()];
@@ -114,9 +119,11 @@ fn blend_dot(rgb: &mut [u8], dot: Dot, center: [f32; 2]) {
             *weight = -(dx_squared + squares[1][y]) / dot.denominator;
         }
         table.exp_row(weights);
-        weights.iter_mut().for_each(|weight| *weight /= peak);
+        for (of_pixel, weight) in value_weights.chunks_exact_mut(3).zip(&*weights) {
+            of_pixel.fill(weight / peak);
+        }
         let row = &mut rgb[(y * FRAME_SIZE + columns.start) * 3..(y * FRAME_SIZE + columns.end) * 3];
-        blend_row(row, weights, dot.color);
+        blend_row(row, &value_weights, &dot.colors);
     }
 }
 
@@ -140,25 +147,12 @@ fn pixels_within(center: f32, reach_squared: f32) -> std::ops::Range<usize> {
     first.min(end)..end
 }
 
-/// Blends `color` over a row of pixels, one weight per pixel; truncates as the published renderer does.
+/// Blends colours over a row of pixels, one weight per value; truncates as the published renderer does.
 ///
-/// The channels are taken apart first, so that several pixels can be blended at a time.
-fn blend_row(row: &mut [u8], weights: &[f32], color: [u8; 3]) {
-    let mut channels = [[0_u8; FRAME_SIZE]; 3];
-    for (i, pixel) in row.chunks_exact(3).enumerate().take(FRAME_SIZE) {
-        for (channel, &value) in channels.iter_mut().zip(pixel) {
-            channel[i] = value;
-        }
-    }
-    for (channel, color) in channels.iter_mut().zip(color.map(f32::from)) {
-        for (value, &weight) in channel.iter_mut().zip(weights) {
-            *value = truncate(f32::from(*value) * (1.0 - weight) + color * weight);
-        }
-    }
-    for (i, pixel) in row.chunks_exact_mut(3).enumerate().take(FRAME_SIZE) {
-        for (value, channel) in pixel.iter_mut().zip(&channels) {
-            *value = channel[i];
-        }
+/// Weights and colours are spread over the values of a pixel, so that several values can be blended at a time.
+fn blend_row(row: &mut [u8], weights: &[f32; ROW_VALUES], colors: &[f32; ROW_VALUES]) {
+    for ((value, &weight), &color) in row.iter_mut().zip(weights).zip(colors) {
+        *value = truncate(f32::from(*value) * (1.0 - weight) + color * weight);
     }
 }
 
