@@ -12,6 +12,7 @@ mod finding;
 mod group;
 mod image;
 mod layout;
+mod linear;
 mod motion;
 mod probe;
 mod profile;

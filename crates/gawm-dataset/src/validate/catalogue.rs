@@ -210,6 +210,11 @@ pub const RULES: &[Rule] = &[
         "an episode has the frames of another one",
         "find the frames that belong to it, or leave the episode out",
     ),
+    warning(
+        "IMAGE-021",
+        "an episode's picture is unlike those of the other episodes",
+        "look at the episode: its camera may have been moved or refocused",
+    ),
     error(
         "VALUE-001",
         "values are NaN or infinite",

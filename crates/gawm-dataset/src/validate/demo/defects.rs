@@ -1,6 +1,6 @@
 //! The defects that are planted, each at a strength between 0 and 1.
 
-use super::world::{Episode, JOINTS, Random, World, changed_frame, flat_frame};
+use super::world::{Episode, JOINTS, Random, World, changed_frame, flat_frame, shifted_frame};
 
 /// The episode that carries a defect of one episode.
 const SICK: usize = 3;
@@ -176,6 +176,10 @@ pub(super) const DEFECTS: &[Defect] = &[
         let share = (n as f64 * (0.7 + 0.3 * s)) as usize;
         let (front, wrist) = w.episodes[SICK].frames.split_at_mut(1);
         front[0][..share].swap_with_slice(&mut wrist[0][..share]);
+    }),
+    here("camera moved", "IMAGE-021", |w, s| {
+        let rows = up_to(s, 7);
+        w.episodes[SICK].frames[0].iter_mut().flatten().for_each(|f| *f = shifted_frame(f, rows));
     }),
     here("dark episode", "IMAGE-010", |w, s| {
         for frame in w.episodes[SICK].frames[0].iter_mut().flatten() {

@@ -278,3 +278,10 @@ pub(super) fn changed_frame(bytes: &Bytes, change: impl Fn(u8) -> u8) -> Bytes {
     picture.rgb.iter_mut().for_each(|v| *v = change(*v));
     encode(&picture)
 }
+
+/// Decodes a frame that was made here, moves it up by some rows and encodes it again.
+pub(super) fn shifted_frame(bytes: &Bytes, rows: usize) -> Bytes {
+    let (_, mut picture) = decode_thumbnail(bytes, 1, &Limits::default()).expect("frames of the demo decode");
+    picture.rgb.rotate_left(3 * FRAME_SIDE * rows);
+    encode(&picture)
+}
