@@ -128,6 +128,7 @@ pub struct Dataset {
     pub limits: ReadLimits,
     /// Rows that passes over the data have read so far, for those who watch.
     pub rows_read: Arc<AtomicU64>,
+    last_footer: files::LastFooter,
 }
 
 impl Dataset {
@@ -176,6 +177,7 @@ impl Dataset {
             defects,
             limits,
             rows_read: Arc::default(),
+            last_footer: files::LastFooter::default(),
         })
     }
 

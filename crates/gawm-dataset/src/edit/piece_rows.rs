@@ -4,7 +4,7 @@ use arrow::array::RecordBatch;
 use parquet::arrow::arrow_reader::{ParquetRecordBatchReaderBuilder, RowSelection, RowSelector};
 
 use super::{EditError, Input, Piece};
-use crate::read::{check_pages, guarded, open_parquet};
+use crate::read::{Dataset, check_pages, guarded};
 
 /// Bytes that a batch aims at.
 const BATCH_BYTES: u64 = 8 << 20;
@@ -29,7 +29,7 @@ pub(super) fn for_each_batch(
         got,
     };
     let (from, to) = (run.start + piece.rows.start, run.start + piece.rows.end.min(run.n_rows));
-    let mut reader = guarded(|| open(file, from, to)).map_err(unreadable)?;
+    let mut reader = guarded(|| open(dataset, run.file, from, to)).map_err(unreadable)?;
     let mut n_rows = 0;
     // A panic of the Parquet reader is an error like others; one of `take` is ours.
     while let Some(batch) =
@@ -42,11 +42,13 @@ pub(super) fn for_each_batch(
 }
 
 fn open(
-    file: &crate::read::DataFile,
+    dataset: &Dataset,
+    index: usize,
     from: u64,
     to: u64,
 ) -> Result<parquet::arrow::arrow_reader::ParquetRecordBatchReader, String> {
-    let (handle, metadata) = open_parquet(&file.path)?;
+    let file = &dataset.files[index];
+    let (handle, metadata) = dataset.open_file(index)?;
     let (mut groups, mut skipped, mut start, mut bytes) = (Vec::new(), 0, 0, 0u64);
     for (group, n_rows) in file.row_groups.iter().enumerate() {
         let end = start + n_rows;

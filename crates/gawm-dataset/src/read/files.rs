@@ -5,6 +5,7 @@ use std::{
     fs::{self, File},
     panic::{AssertUnwindSafe, catch_unwind},
     path::{Path, PathBuf},
+    sync::{Mutex, PoisonError},
 };
 
 use arrow::datatypes::{DataType, SchemaRef};
@@ -15,7 +16,7 @@ use parquet::arrow::arrow_reader::{
 use rayon::prelude::*;
 
 use super::{
-    Column, DType, Defect, DefectKind, EpisodeEntry, FeatureDecl, Info, ReadLimits, declared,
+    Column, DType, Dataset, Defect, DefectKind, EpisodeEntry, FeatureDecl, Info, ReadLimits, declared,
     paths::{self, TemplateValues},
 };
 
@@ -61,17 +62,50 @@ pub(crate) fn guarded<T>(read: impl FnOnce() -> Result<T, String>) -> Result<T, 
         .unwrap_or_else(|_| Err("content that the Parquet reader cannot digest".to_owned()))
 }
 
+/// The footer that was read last: a file of many episodes is gone through piece by piece, and a footer of as many row
+/// groups takes longer to read than a piece.
+#[derive(Debug, Default)]
+pub(super) struct LastFooter(Mutex<Option<(usize, u64, ArrowReaderMetadata)>>);
+
+impl Dataset {
+    /// Opens a data file by its position in [`Dataset::files`], as [`open_parquet`] does.
+    pub(crate) fn open_file(&self, index: usize) -> Result<(File, ArrowReaderMetadata), String> {
+        let path = &self.files[index].path;
+        let last = || self.last_footer.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let (file, size) = open_regular(path)?;
+        let known =
+            last().as_ref().filter(|(i, s, _)| (*i, *s) == (index, size)).map(|known| known.2.clone());
+        if let Some(metadata) = known {
+            return Ok((file, metadata));
+        }
+        let metadata = checked_footer(&file, size)?;
+        *last() = Some((index, size, metadata.clone()));
+        Ok((file, metadata))
+    }
+}
+
 /// Opens a Parquet file and checks its footer against the file's size.
 pub(crate) fn open_parquet(path: &Path) -> Result<(File, ArrowReaderMetadata), String> {
+    let (file, size) = open_regular(path)?;
+    let metadata = checked_footer(&file, size)?;
+    Ok((file, metadata))
+}
+
+/// Opens a file, and returns its size beside it.
+fn open_regular(path: &Path) -> Result<(File, u64), String> {
     // Opening a pipe waits for somebody to write into it.
     if !fs::metadata(path).map_err(|e| e.to_string())?.is_file() {
         return Err("something that is not a regular file".to_owned());
     }
     let file = File::open(path).map_err(|e| e.to_string())?;
     let size = file.metadata().map_err(|e| e.to_string())?.len();
-    declared::check_schema(&file, size)?;
+    Ok((file, size))
+}
+
+fn checked_footer(file: &File, size: u64) -> Result<ArrowReaderMetadata, String> {
+    declared::check_schema(file, size)?;
     let metadata =
-        guarded(|| ArrowReaderMetadata::load(&file, ArrowReaderOptions::new()).map_err(|e| e.to_string()))?;
+        guarded(|| ArrowReaderMetadata::load(file, ArrowReaderOptions::new()).map_err(|e| e.to_string()))?;
     let mut n_rows: i64 = 0;
     for group in metadata.metadata().row_groups() {
         n_rows = n_rows
@@ -101,7 +135,7 @@ pub(crate) fn open_parquet(path: &Path) -> Result<(File, ArrowReaderMetadata), S
         let declared = metadata.metadata().file_metadata().num_rows();
         return Err(format!("a footer of {declared} rows whose row groups have {n_rows}"));
     }
-    Ok((file, metadata))
+    Ok(metadata)
 }
 
 /// Lists and opens the data files, comparing them with what metadata name.

@@ -248,7 +248,7 @@ impl Dataset {
         columns: &[&str],
         batch_rows: usize,
     ) -> Result<parquet::arrow::arrow_reader::ParquetRecordBatchReader, String> {
-        let (file, metadata) = files::open_parquet(&self.files[unit.file].path)?;
+        let (file, metadata) = self.open_file(unit.file)?;
         let schema = metadata.schema().clone();
         let roots = columns.iter().filter_map(|name| schema.index_of(name).ok());
         let mask = ProjectionMask::roots(metadata.parquet_schema(), roots);
