@@ -288,4 +288,5 @@ def main():
     print(f"{found} of {planted}")
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -295,11 +295,26 @@ fn traces_of(dataset: &Dataset, columns: &[String], rows: &EpisodeRows, n_frames
         Some(Traces {
             name: name.clone(),
             marks: marks.clone(),
-            dims: dims.iter().enumerate().take(MAX_DIMS).map(dim).collect(),
+            dims: widest(dims).into_iter().map(|i| dim((i, &dims[i]))).collect(),
             n_hidden: dims.len().saturating_sub(MAX_DIMS),
         })
     };
     columns.iter().filter_map(traces).collect()
+}
+
+/// Returns the dims that are drawn, in their order: of many those that cover most.
+fn widest(dims: &[Vec<f64>]) -> Vec<usize> {
+    let range = |dim: &Vec<f64>| {
+        let finite = dim.iter().filter(|v| v.is_finite());
+        let (low, high) =
+            finite.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)));
+        (high - low).max(0.0)
+    };
+    let mut order: Vec<(f64, usize)> = dims.iter().map(range).zip(0..).collect();
+    order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    let mut chosen: Vec<usize> = order.into_iter().take(MAX_DIMS).map(|(_, i)| i).collect();
+    chosen.sort_unstable();
+    chosen
 }
 
 impl TraceDim {
@@ -347,6 +362,16 @@ mod tests {
         assert_eq!(frame_rows(1, 8), [0]);
         assert_eq!(frame_rows(5, 1), [0]);
         assert_eq!(frame_rows(0, 8), [] as [usize; 0]);
+    }
+
+    #[test]
+    fn of_many_dims_those_that_move_are_drawn() {
+        let mut dims = vec![vec![0.5, 0.5, f64::NAN]; 20];
+        dims[17] = vec![0.0, 2.0, 1.0];
+        dims[15] = vec![0.0, 1.0, f64::NAN];
+        let chosen = widest(&dims);
+        assert_eq!(chosen.len(), MAX_DIMS);
+        assert!(chosen.ends_with(&[15, 17]) && chosen.starts_with(&[0, 1]), "{chosen:?}");
     }
 
     #[test]

@@ -12,9 +12,11 @@ mod finding;
 mod group;
 mod image;
 mod layout;
+mod linear;
 mod motion;
 mod probe;
 mod profile;
+mod relation;
 mod render;
 mod rest;
 mod robust;
@@ -139,6 +141,7 @@ pub fn examine(dataset: &Dataset, options: &ValidateOptions) -> Result<Examinati
     findings.extend(structure::judge_stats(dataset, &plan, &runs));
     findings.extend(value::judge(&plan, thresholds, dataset.info.fps, &runs));
     findings.extend(semantic::judge(dataset, &plan, thresholds, &runs));
+    findings.extend(relation::judge(&plan, thresholds, &runs));
     findings.extend(split::judge(dataset, &plan, thresholds, &runs));
     if has_images {
         let judged = image::judge(dataset, thresholds, &runs, |_| {});

@@ -56,7 +56,7 @@ pub(super) fn run(arguments: &TrimArguments, quiet: bool) -> Result<u8, Failure>
     if arguments.edit.format == Format::Text && !quiet {
         let cut = trimmed.iter().filter(|t| t.kept.end - t.kept.start < t.rows);
         for t in cut.take(50) {
-            say!("episode {}: rows {} to {} of {}", t.episode, t.kept.start, t.kept.end, t.rows);
+            say!("episode {}: keeps rows {} to {} of {}", t.episode, t.kept.start, t.kept.end, t.rows);
         }
         let n_cut = trimmed.iter().filter(|t| t.kept.end - t.kept.start < t.rows).count();
         if n_cut > 50 {

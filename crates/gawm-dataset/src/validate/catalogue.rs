@@ -210,6 +210,11 @@ pub const RULES: &[Rule] = &[
         "an episode has the frames of another one",
         "find the frames that belong to it, or leave the episode out",
     ),
+    warning(
+        "IMAGE-021",
+        "an episode's picture is unlike those of the other episodes",
+        "look at the episode: its camera may have been moved or refocused",
+    ),
     error(
         "VALUE-001",
         "values are NaN or infinite",
@@ -332,6 +337,11 @@ pub const RULES: &[Rule] = &[
         "SEMANTIC-015",
         "states follow their actions at another rate than in the other episodes",
         "look for rows that are missing or repeated throughout, or for another rate",
+    ),
+    warning(
+        "SEMANTIC-016",
+        "a signal is not related to the others as in the other episodes",
+        "check time, sign, unit, zero and place of this dim in this episode, and of those it depends on",
     ),
     warning("SPLIT-001", "two episodes are the same", "remove one of them"),
     warning(

@@ -6,7 +6,7 @@ use super::{
 };
 
 /// Fewer dims turn, stop and collide: of them only what nothing else explains counts.
-const FEW_DIMS: usize = 4;
+const FEW_DIMS: usize = 5;
 /// Fewest dims whose common direction shows that a single row is missing.
 const SURE_DIMS: usize = 6;
 /// Fewest steps within one that count when they are sure.

@@ -5,6 +5,7 @@ use super::{
     group::{GroupMeasure, measure_groups},
     layout::{FeatureLayout, GroupKind, Purpose},
     motion::{MotionProfile, Place, motion_profile, places, share_of_range},
+    relation,
     signal::{Signal, measure},
     time::{TimeProfile, time_profile},
     tracking::{Tracking, track},
@@ -35,6 +36,8 @@ pub(super) struct Plan {
     pub(super) keeps_speed: bool,
     /// Whether trajectories are kept at a fixed distance of rows, for copies that were cut.
     pub(super) keeps_aligned: bool,
+    /// Rows of each run that are kept for relations between dims.
+    relation_rows: usize,
     /// Names of validity columns.
     pub(super) validity: Vec<String>,
 }
@@ -56,7 +59,18 @@ impl Plan {
             dataset.info.features.iter().filter(|f| f.name.starts_with("gawm.valid") && f.is_numeric());
         let validity = validity.map(|f| f.name.clone()).collect();
         let keeps_aligned = dataset.runs.len() <= MAX_ALIGNED_RUNS;
-        Plan { layouts, states, actions, pairs, window_rows, keeps_speed, keeps_aligned, validity }
+        let relation_rows = relation::rows_per_run(states.len(), actions.len(), dataset.runs.len());
+        Plan {
+            layouts,
+            states,
+            actions,
+            pairs,
+            window_rows,
+            keeps_speed,
+            keeps_aligned,
+            relation_rows,
+            validity,
+        }
     }
 
     /// Returns the layout and name of a dim.
@@ -105,6 +119,7 @@ pub(super) struct RunProfile {
     /// For each action dim's pair: range of the action in the state's longest rest, relative to its whole range.
     pub(super) rest_drive: Vec<f64>,
     pub(super) tracking: Option<Tracking>,
+    pub(super) relations: relation::Sample,
     pub(super) time: TimeProfile,
     pub(super) motion: MotionProfile,
     pub(super) content_hash: [u8; 16],
@@ -136,6 +151,8 @@ pub(super) fn profile_run(
     let is_whole = states.len() == plan.states.len() && actions.len() == plan.actions.len();
     let tracking =
         if is_whole && !plan.pairs.is_empty() { track(&actions, &states, &plan.pairs) } else { None };
+    let relations =
+        if is_whole { relation::sample(&states, &actions, plan.relation_rows) } else { Default::default() };
     let mut findings = super::row_checks::check_rows(dataset, rows);
     let (time, time_findings) = time_profile(dataset, thresholds, rows);
     findings.extend(time_findings);
@@ -159,6 +176,7 @@ pub(super) fn profile_run(
         features,
         rest_drive,
         tracking,
+        relations,
         time,
         motion,
         content_hash,

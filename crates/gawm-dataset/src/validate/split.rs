@@ -185,8 +185,11 @@ fn near_duplicates(
     findings: &mut Vec<Finding>,
 ) {
     let n_dims = plan.states.len() + plan.actions.len();
+    // Of equal runs one speaks for all.
+    let mut seen = BTreeSet::new();
+    let is_usable = |r: &&RunProfile| r.fingerprint.len() == n_dims * FINGERPRINT_POINTS && r.n_rows > 4;
     let usable: Vec<&RunProfile> =
-        runs.iter().filter(|r| r.fingerprint.len() == n_dims * FINGERPRINT_POINTS && r.n_rows > 4).collect();
+        runs.iter().filter(is_usable).filter(|r| seen.insert(r.content_hash)).collect();
     if usable.len() < 2 || n_dims == 0 {
         return;
     }

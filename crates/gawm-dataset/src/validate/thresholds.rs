@@ -143,6 +143,10 @@ thresholds! {
         window_share: 0.5,
         /// Distance of an episode's offset from the others, in their robust standard deviations (SEMANTIC-014).
         offset_sigmas: 12.0,
+        /// Least error of a model that holds elsewhere, relative to the size of what it explains (SEMANTIC-016).
+        relation_error: 0.5,
+        /// Ratio of that error to the largest one elsewhere; more with fewer than ten episodes (SEMANTIC-016).
+        relation_ratio: 2.2,
     }
 }
 

@@ -6,6 +6,7 @@ use super::{
     Finding,
     image::{CameraRun, FrameMeasure, THUMB, THUMB_SIDE},
     profile::RunProfile,
+    relation::outlying,
     robust::median,
 };
 
@@ -17,6 +18,11 @@ const SHARED_SHARE: f64 = 0.5;
 const KEPT_FRAMES: u64 = 4;
 /// Least contrast of frames that tell something.
 const FLAT: f32 = 6.0;
+
+/// How many times farther than the others an episode's mean picture is.
+const FAR_RATIO: f64 = 2.5;
+/// Fewest episodes of which one can be unlike the others.
+const MIN_RUNS: usize = 6;
 
 /// The frames of all cameras in one run.
 type Measured = (usize, Vec<CameraRun>);
@@ -43,6 +49,7 @@ pub(super) fn judge(
             .collect();
         views.exchanged(&thumbs, &usual, findings);
         views.turned(&thumbs, &usual, findings);
+        views.unlike(&thumbs, &usual, findings);
     }
 }
 
@@ -108,6 +115,39 @@ impl Views<'_> {
                     findings
                         .push(finding.feature(&self.cameras[camera]).measured(own / other.max(1e-9), 2.0));
                 }
+            }
+        }
+    }
+
+    /// Finds episodes whose mean picture is unlike those of the others: a camera that was moved, or shows something else.
+    fn unlike(&self, thumbs: &[Vec<Vec<f64>>], usual: &[Vec<f64>], findings: &mut Vec<Finding>) {
+        if self.measured.len() < MIN_RUNS {
+            return;
+        }
+        for (camera, name) in self.cameras.iter().enumerate() {
+            // A brighter picture is another matter.
+            let level = |thumb: &[f64]| thumb.iter().sum::<f64>() / THUMB as f64;
+            let distance = |thumb: &Vec<f64>| {
+                let by = level(&usual[camera]) - level(thumb);
+                far(&thumb.iter().map(|v| v + by).collect::<Vec<_>>(), &usual[camera])
+            };
+            let distances: Vec<f64> = thumbs.iter().map(|t| distance(&t[camera])).collect();
+            for (run, ratio, usual) in outlying(&distances, FAR, FAR_RATIO) {
+                let episode = self.episode(self.measured[run].0);
+                let is_said = |f: &Finding| {
+                    f.episode == Some(episode)
+                        && matches!(f.code, "IMAGE-009" | "IMAGE-018")
+                        && f.feature.as_deref() == Some(name)
+                };
+                if findings.iter().any(is_said) {
+                    continue;
+                }
+                let message = format!(
+                    "the mean picture differs by {:.0} levels from that of the other episodes, theirs by about {usual:.0}: the camera was moved, or shows something else",
+                    distances[run]
+                );
+                let finding = Finding::new("IMAGE-021", message).episode(episode).feature(name);
+                findings.push(finding.measured(distances[run], distances[run] / ratio * FAR_RATIO));
             }
         }
     }

@@ -1,9 +1,11 @@
 //! The defects that are planted, each at a strength between 0 and 1.
 
-use super::world::{Episode, JOINTS, Random, World, changed_frame, flat_frame};
+use super::world::{Episode, JOINTS, Random, World, changed_frame, flat_frame, shifted_frame};
 
 /// The episode that carries a defect of one episode.
 const SICK: usize = 3;
+/// The state that nothing commands.
+const CABLE: usize = 14;
 
 /// One kind of defect.
 pub(super) struct Defect {
@@ -175,6 +177,10 @@ pub(super) const DEFECTS: &[Defect] = &[
         let (front, wrist) = w.episodes[SICK].frames.split_at_mut(1);
         front[0][..share].swap_with_slice(&mut wrist[0][..share]);
     }),
+    here("camera moved", "IMAGE-021", |w, s| {
+        let rows = up_to(s, 7);
+        w.episodes[SICK].frames[0].iter_mut().flatten().for_each(|f| *f = shifted_frame(f, rows));
+    }),
     here("dark episode", "IMAGE-010", |w, s| {
         for frame in w.episodes[SICK].frames[0].iter_mut().flatten() {
             *frame = changed_frame(frame, |v| (f64::from(v) * (1.0 - 0.7 * s)) as u8);
@@ -281,6 +287,20 @@ pub(super) const DEFECTS: &[Defect] = &[
     }),
     here("joint zero moved", "SEMANTIC-014", |w, s| {
         w.episodes[SICK].state[3].iter_mut().for_each(|v| *v += 0.8 * s)
+    }),
+    here("signal late against the others", "SEMANTIC-016", |w, s| {
+        let cable = &mut w.episodes[SICK].state[CABLE];
+        let by = up_to(s, 8);
+        let n = cable.len();
+        cable.copy_within(..n - by, by);
+    }),
+    here("signal drifts against the others", "SEMANTIC-016", |w, s| {
+        let cable = &mut w.episodes[SICK].state[CABLE];
+        let n = cable.len() as f64;
+        cable.iter_mut().enumerate().for_each(|(t, v)| *v += 0.4 * s * t as f64 / n);
+    }),
+    here("signal scaled or mirrored against the others", "SEMANTIC-016", |w, s| {
+        w.episodes[SICK].state[CABLE].iter_mut().for_each(|v| *v = 0.6 + (*v - 0.6) * (1.0 - 2.0 * s));
     }),
     whole("task without text", "SEMANTIC-006", |w, s| {
         w.tasks[1] = if s < 0.5 { "task 2" } else { "" }.to_owned()

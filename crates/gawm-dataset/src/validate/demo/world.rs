@@ -14,7 +14,7 @@ pub(super) const JOINTS: usize = 6;
 const FRAME_SIDE: usize = 32;
 
 /// Names of the state's dims; the first seven are also those of the action.
-pub(super) const STATE_NAMES: [&str; 14] = [
+pub(super) const STATE_NAMES: [&str; 15] = [
     "shoulder_pan.pos",
     "shoulder_lift.pos",
     "elbow.pos",
@@ -29,6 +29,7 @@ pub(super) const STATE_NAMES: [&str; 14] = [
     "tool_quat.y",
     "tool_quat.z",
     "tool_quat.w",
+    "cable.length",
 ];
 
 /// A generator of pseudo-random numbers with a fixed sequence (SplitMix64).
@@ -163,6 +164,8 @@ fn episode(random: &mut Random, number: usize, has_cameras: bool) -> Episode {
     let quaternion = quaternions(&state);
     state.extend(xyz);
     state.extend(quaternion);
+    // Nothing commands the cable: it follows from the joints.
+    state.push((0..n).map(|t| 0.6 + 0.2 * state[0][t] - 0.15 * state[1][t] + 0.1 * state[2][t]).collect());
     let heading = (0..n).map(|t| 2.0 * state[2][t]).collect::<Vec<f64>>();
     let heading = vec![heading.iter().map(|a| a.sin()).collect(), heading.iter().map(|a| a.cos()).collect()];
     let six = six_dims(&state);
@@ -273,5 +276,12 @@ pub(super) fn flat_frame(level: u8, scale: usize) -> Bytes {
 pub(super) fn changed_frame(bytes: &Bytes, change: impl Fn(u8) -> u8) -> Bytes {
     let (_, mut picture) = decode_thumbnail(bytes, 1, &Limits::default()).expect("frames of the demo decode");
     picture.rgb.iter_mut().for_each(|v| *v = change(*v));
+    encode(&picture)
+}
+
+/// Decodes a frame that was made here, moves it up by some rows and encodes it again.
+pub(super) fn shifted_frame(bytes: &Bytes, rows: usize) -> Bytes {
+    let (_, mut picture) = decode_thumbnail(bytes, 1, &Limits::default()).expect("frames of the demo decode");
+    picture.rgb.rotate_left(3 * FRAME_SIDE * rows);
     encode(&picture)
 }
