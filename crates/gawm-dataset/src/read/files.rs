@@ -68,8 +68,11 @@ pub(crate) fn guarded<T>(read: impl FnOnce() -> Result<T, String>) -> Result<T, 
 pub(super) struct LastFooter(Mutex<Option<(usize, u64, ArrowReaderMetadata)>>);
 
 impl Dataset {
-    /// Opens a data file by its position in [`Dataset::files`], as [`open_parquet`] does.
-    pub(crate) fn open_file(&self, index: usize) -> Result<(File, ArrowReaderMetadata), String> {
+    /// Opens a data file by its position in [`Dataset::files`], and checks its footer against its size.
+    ///
+    /// # Errors
+    /// The file cannot be opened or its footer not be used; the text says what it is instead.
+    pub fn open_file(&self, index: usize) -> Result<(File, ArrowReaderMetadata), String> {
         let path = &self.files[index].path;
         let last = || self.last_footer.0.lock().unwrap_or_else(PoisonError::into_inner);
         let (file, size) = open_regular(path)?;

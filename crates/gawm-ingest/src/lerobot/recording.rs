@@ -347,10 +347,9 @@ impl LerobotRecording {
 
     fn read_span(&self, span: &Span, out: &mut Block) -> Result<(), String> {
         let run = self.dataset.runs[self.episodes[span.episode].run];
-        let file = &self.dataset.files[run.file];
-        let opened = File::open(&file.path).map_err(|error| error.to_string())?;
+        let (opened, footer) = self.dataset.open_file(run.file)?;
         let shared = opened.try_clone().map_err(|error| error.to_string())?;
-        let builder = ParquetRecordBatchReaderBuilder::try_new(shared).map_err(|error| error.to_string())?;
+        let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(shared, footer);
         let schema = Arc::clone(builder.schema());
         let columns: Vec<(usize, &Arc<Channel>)> = self
             .channels
