@@ -6,10 +6,10 @@ mod sheet;
 
 use std::collections::BTreeSet;
 
-use gawm_image::{ImageError, Limits, Thumbnail, decode_thumbnail};
+use gawm_image::{ImageError, Limits, Thumbnail};
 use gawm_schema::ContentHash;
 
-use crate::read::{Dataset, EpisodeRows, FrameBytes, ScanError};
+use crate::read::{Dataset, EpisodeRows, FrameBytes, NoPicture, ScanError};
 use crate::validate::{action_columns, dim_labels, motion_columns};
 
 /// Width of a frame in pixels.
@@ -132,7 +132,7 @@ pub fn preview_html(dataset: &Dataset, options: &PreviewOptions) -> Result<Strin
 
 fn clips(dataset: &Dataset, options: &PreviewOptions) -> Result<Vec<Clip>, PreviewError> {
     let chosen = chosen_runs(dataset, options)?;
-    let in_files = dataset.image_columns();
+    let in_files = dataset.frame_columns();
     let all: Vec<&str> =
         dataset.info.features.iter().filter(|f| f.is_camera()).map(|f| f.name.as_str()).collect();
     if let Some(unknown) = options.cameras.iter().find(|name| !all.contains(&name.as_str())) {
@@ -237,18 +237,17 @@ fn frames_of(
         Ok(frames) => frames,
         Err(_unreadable) => return rows.iter().map(|row| (*row, Err("unreadable".to_owned()))).collect(),
     };
-    let picture = |frame: Option<&FrameBytes>| match frame {
-        Some(FrameBytes::Encoded(bytes)) => {
-            let decoded = decode_thumbnail(bytes, FRAME_WIDTH / 2, &Limits { max_pixels: 1 << 26 });
-            let (_, picture) = decoded.map_err(|error| match error {
-                ImageError::Unsuitable { .. } => "depth".to_owned(),
-                _ => "damaged".to_owned(),
-            })?;
-            let height = (picture.height * FRAME_WIDTH / picture.width.max(1)).clamp(1, MAX_FRAME_HEIGHT);
-            Ok(picture.shrunk(FRAME_WIDTH, height))
-        }
-        Some(FrameBytes::TooLarge(_)) => Err("too large".to_owned()),
-        Some(FrameBytes::Absent) | None => Err("no picture".to_owned()),
+    let picture = |frame: Option<&FrameBytes>| {
+        let limits = Limits { max_pixels: 1 << 26 };
+        let found = frame.unwrap_or(&FrameBytes::Absent).thumbnail(FRAME_WIDTH / 2, &limits);
+        let (_, picture) = found.map_err(|reason| match reason {
+            NoPicture::Absent => "no picture".to_owned(),
+            NoPicture::Depth => "depth".to_owned(),
+            NoPicture::TooLarge(_) => "too large".to_owned(),
+            NoPicture::Damaged(_) => "damaged".to_owned(),
+        })?;
+        let height = (picture.height * FRAME_WIDTH / picture.width.max(1)).clamp(1, MAX_FRAME_HEIGHT);
+        Ok(picture.shrunk(FRAME_WIDTH, height))
     };
     rows.iter().enumerate().map(|(k, row)| (*row, picture(frames.get(k)))).collect()
 }

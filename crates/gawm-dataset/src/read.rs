@@ -27,6 +27,7 @@ pub use column::{Column, ColumnValues};
 pub use defect::{Defect, DefectKind};
 pub use episode_table::{EpisodeEntry, VideoSpan};
 pub use files::{DataFile, Run};
+pub(crate) use frames::NoPicture;
 pub use frames::{FrameBytes, FrameReader};
 pub use info::{DType, FeatureDecl, FormatVersion, Info};
 pub use mp4::{Mp4Error, VideoTrack, read_video_track};

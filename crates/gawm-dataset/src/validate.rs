@@ -46,7 +46,7 @@ pub use thresholds::{
 };
 pub use windows::WindowYield;
 
-use crate::read::{DType, Dataset, ScanError};
+use crate::read::{Dataset, ScanError};
 
 /// Most findings of one code that are listed.
 const MAX_LISTED: usize = 1000;
@@ -130,7 +130,7 @@ pub fn validate(dataset: &Dataset, options: &ValidateOptions) -> Result<Report, 
 pub fn examine(dataset: &Dataset, options: &ValidateOptions) -> Result<Examination, ScanError> {
     let thresholds = &options.thresholds;
     let layouts = layout::layouts(dataset);
-    let has_images = options.checks_images && dataset.info.features.iter().any(|f| f.dtype == DType::Image);
+    let has_images = options.checks_images && !dataset.frame_columns().is_empty();
     let plan = profile::Plan::new(dataset, layouts, options.window_rows, has_images);
     let columns: Vec<String> = dataset.scalar_columns();
     let (runs, scan_defects) =

@@ -200,6 +200,7 @@ impl Data {
                     cause,
                 }),
                 FrameBytes::Absent => Err(missing(row, "nothing")),
+                FrameBytes::Video(_) | FrameBytes::Undecodable(_) => Err(missing(row, "a frame of a video")),
                 FrameBytes::TooLarge(size) => Err(missing(row, &format!("{size} bytes"))),
             })
             .collect()

@@ -15,4 +15,6 @@ mod rows;
 pub mod run;
 pub mod suggest;
 pub mod tabular;
-mod video;
+
+/// What to do about a build without video.
+pub(crate) const VIDEO_HINT: &str = "build with `cargo build --release -p gawm-ingest --features video` (needs libavcodec-dev, libavformat-dev, libavutil-dev), convert the videos to images (lerobot-edit-dataset has convert_video_to_image), or remove its stream";

@@ -1,4 +1,4 @@
-//! Encoded camera frames: one pass over all of them, or single ones by position.
+//! Camera frames, in the data files and in videos beside them: one pass over all of them, or single ones by position.
 
 use std::sync::Mutex;
 
@@ -7,6 +7,8 @@ use arrow::{
     datatypes::DataType,
 };
 use bytes::Bytes;
+use gawm_image::{ImageError, Limits, Thumbnail, decode_thumbnail};
+use gawm_video::{RgbFrame, VideoError, VideoLanes};
 use parquet::{
     arrow::{
         ProjectionMask,
@@ -24,15 +26,81 @@ use super::{DType, Dataset, Defect, DefectKind, Run, declared, files, scan::Unit
 /// Frames per record batch: images are large.
 const BATCH_FRAMES: usize = 32;
 
-/// One encoded frame as it lies in the file.
+/// One frame as it lies in the file, or as it comes out of a video.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum FrameBytes {
     /// JPEG, PNG or TIFF bytes.
     Encoded(Bytes),
-    /// Null, or a struct without bytes.
+    /// A frame of a video: rows of 8-bit RGB.
+    Video(RgbFrame),
+    /// A frame of a video that cannot be decoded, and why.
+    Undecodable(String),
+    /// Null, a struct without bytes, or no frame of a video at the row's time.
     Absent,
     /// More bytes than are permitted.
     TooLarge(usize),
+}
+
+/// Why there is no picture of a frame.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum NoPicture {
+    /// There is no frame.
+    Absent,
+    /// Depth in floats.
+    Depth,
+    /// More bytes than are permitted.
+    TooLarge(usize),
+    /// It cannot be decoded.
+    Damaged(String),
+}
+
+impl FrameBytes {
+    /// Returns height, width and channels of the frame, and a small picture of it whose sides have at least `min_side`
+    /// pixels if its own have.
+    pub(crate) fn thumbnail(
+        &self,
+        min_side: usize,
+        limits: &Limits,
+    ) -> Result<([u32; 3], Thumbnail), NoPicture> {
+        match self {
+            FrameBytes::Encoded(bytes) => match decode_thumbnail(bytes, min_side, limits) {
+                Ok((header, picture)) => {
+                    Ok(([header.height, header.width, u32::from(header.channels)], picture))
+                }
+                Err(ImageError::Unsuitable { .. }) => Err(NoPicture::Depth),
+                Err(error) => Err(NoPicture::Damaged(error.to_string())),
+            },
+            FrameBytes::Video(frame) => {
+                let (width, height) = (frame.width as usize, frame.height as usize);
+                let whole = Thumbnail { width, height, rgb: frame.data.to_vec() };
+                let is_enough = |parts: &usize| width.min(height) / parts >= min_side;
+                let picture = match [8, 4, 2].into_iter().find(is_enough) {
+                    Some(parts) => whole.shrunk(width / parts, height / parts),
+                    None => whole,
+                };
+                Ok(([frame.height, frame.width, 3], picture))
+            }
+            FrameBytes::Undecodable(reason) => Err(NoPicture::Damaged(reason.clone())),
+            FrameBytes::Absent => Err(NoPicture::Absent),
+            FrameBytes::TooLarge(bytes) => Err(NoPicture::TooLarge(*bytes)),
+        }
+    }
+
+    /// Returns the bytes that tell frames apart.
+    pub(crate) fn bytes(&self) -> Option<&[u8]> {
+        match self {
+            FrameBytes::Encoded(bytes) | FrameBytes::Video(RgbFrame { data: bytes, .. }) => Some(bytes),
+            _ => None,
+        }
+    }
+
+    fn of_video(frame: Result<RgbFrame, VideoError>) -> FrameBytes {
+        match frame {
+            Ok(frame) => FrameBytes::Video(frame),
+            Err(error) if error.is_no_frame() => FrameBytes::Absent,
+            Err(error) => FrameBytes::Undecodable(error.to_string()),
+        }
+    }
 }
 
 /// What is called with the frames of one run.
@@ -53,6 +121,21 @@ impl Dataset {
         images.map(|f| f.name.clone()).collect()
     }
 
+    /// Returns the cameras whose frames can be had: those in the data files, and those in videos where this build decodes
+    /// video.
+    pub fn frame_columns(&self) -> Vec<String> {
+        let mut columns = self.image_columns();
+        if gawm_video::IS_BUILT {
+            let is_there = |name: &str| {
+                let mut paths = self.episodes.iter().filter_map(|entry| self.video_path(entry, name)?.ok());
+                paths.any(|path| self.root.join(path).is_file())
+            };
+            let videos = self.info.features.iter().filter(|f| f.dtype == DType::Video && is_there(&f.name));
+            columns.extend(videos.map(|f| f.name.clone()));
+        }
+        columns
+    }
+
     /// Passes over all frames of the given cameras; results are in the order of [`Dataset::runs`].
     pub fn scan_frames<F: FrameReader>(
         &self,
@@ -61,10 +144,12 @@ impl Dataset {
         progress: impl Fn(usize) + Sync,
     ) -> (Vec<(usize, F::Output)>, Vec<Defect>) {
         let defects = Mutex::new(Vec::new());
+        let lanes = VideoLanes::default();
         let read = |unit: &Unit| {
             let mut results = Vec::new();
-            let outcome =
-                files::guarded(|| self.read_frames_of_unit(unit, cameras, &begin, &progress, &mut results));
+            let outcome = files::guarded(|| {
+                self.read_frames_of_unit(unit, (cameras, &lanes), &begin, &progress, &mut results)
+            });
             if let Err(got) = outcome {
                 let place = &self.files[unit.file].relative;
                 let defect = Defect::new(DefectKind::UnreadableFile, place, "readable frames", got);
@@ -84,7 +169,7 @@ impl Dataset {
     fn read_frames_of_unit<F: FrameReader>(
         &self,
         unit: &Unit,
-        cameras: &[String],
+        (cameras, lanes): (&[String], &VideoLanes),
         begin: &(impl Fn(usize, &Run) -> F + Sync),
         progress: &(impl Fn(usize) + Sync),
         results: &mut Vec<(usize, F::Output)>,
@@ -93,7 +178,13 @@ impl Dataset {
         let mut runs = unit.runs.clone();
         let mut row = 0;
         let mut state: Option<F> = None;
-        for batch in self.open_unit(unit, &names, BATCH_FRAMES)? {
+        let schema = &self.files[unit.file].schema;
+        let mut read = names.clone();
+        if !names.iter().any(|name| schema.field_with_name(name).is_ok()) {
+            // Something has to say how many rows there are.
+            read.extend(schema.fields().first().map(|field| field.name().as_str()));
+        }
+        for batch in self.open_unit(unit, &read, BATCH_FRAMES)? {
             let batch = batch.map_err(|e| e.to_string())?;
             let arrays: Vec<Option<&ArrayRef>> =
                 names.iter().map(|name| batch.column_by_name(name)).collect();
@@ -110,7 +201,16 @@ impl Dataset {
                 }
                 row += 1;
                 if row as u64 == run.n_rows {
-                    results.extend(state.take().map(|s| (runs.start, s.finish())));
+                    if let Some(mut reader) = state.take() {
+                        for (camera, name) in cameras.iter().enumerate().filter(|(c, _)| arrays[*c].is_none())
+                        {
+                            let rows: Vec<usize> = (0..row).collect();
+                            self.video_frames(lanes, runs.start, name, &rows, |row, frame| {
+                                reader.frame(camera, row, frame);
+                            });
+                        }
+                        results.push((runs.start, reader.finish()));
+                    }
                     runs.start += 1;
                     row = 0;
                 }
@@ -118,6 +218,29 @@ impl Dataset {
             progress(batch.num_rows());
         }
         Ok(())
+    }
+
+    /// Calls `take` with the frames of a camera whose frames lie in a video, at the times of rows of a run.
+    ///
+    /// Rows are `1 / fps` apart, whatever `timestamp` says: what it says is judged elsewhere.
+    fn video_frames(
+        &self,
+        lanes: &VideoLanes,
+        run_index: usize,
+        camera: &str,
+        rows: &[usize],
+        mut take: impl FnMut(usize, FrameBytes),
+    ) {
+        let entry = self.entry(self.runs[run_index].episode_index);
+        let span = entry.and_then(|entry| Some((entry, entry.videos.get(camera)?)));
+        let Some((path, span)) =
+            span.and_then(|(entry, span)| Some((self.video_path(entry, camera)?.ok()?, span)))
+        else {
+            return rows.iter().for_each(|row| take(*row, FrameBytes::Absent));
+        };
+        let secs = |row: &usize| span.from_timestamp_secs + *row as f64 / self.info.fps;
+        let wanted: Vec<f64> = rows.iter().map(secs).collect();
+        lanes.read(&self.root.join(path), &wanted, |at, frame| take(rows[at], FrameBytes::of_video(frame)));
     }
 
     fn frame_of(&self, array: &ArrayRef, i: usize) -> FrameBytes {
@@ -159,6 +282,13 @@ impl Dataset {
     ) -> Result<Vec<FrameBytes>, String> {
         let run = &self.runs[run_index];
         let file = &self.files[run.file];
+        if gawm_video::IS_BUILT && file.schema.field_with_name(camera).is_err() {
+            let mut frames = Vec::with_capacity(rows.len());
+            let rows: Vec<usize> = rows.iter().copied().filter(|row| (*row as u64) < run.n_rows).collect();
+            let lanes = VideoLanes::default();
+            self.video_frames(&lanes, run_index, camera, &rows, |_, frame| frames.push(frame));
+            return Ok(frames);
+        }
         let (handle, _) = files::open_parquet(&file.path)?;
         files::guarded(|| {
             let options = ArrowReaderOptions::new().with_page_index_policy(PageIndexPolicy::Optional);

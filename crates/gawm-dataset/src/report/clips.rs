@@ -51,7 +51,7 @@ pub(super) fn worst_clips(material: &Material<'_>, page: &mut String) {
 /// Chooses findings that name rows of a signal or of a camera: the worst first, one per rule and episode, and not all
 /// of one rule.
 fn chosen<'a>(material: &'a Material<'_>) -> Vec<&'a Finding> {
-    let cameras = material.dataset.image_columns();
+    let cameras = material.dataset.frame_columns();
     let is_clip = |f: &&Finding| {
         let is_camera = f.feature.as_ref().is_some_and(|name| cameras.contains(name));
         f.severity >= Severity::Warning

@@ -3,7 +3,7 @@
 use std::{collections::BTreeMap, fmt::Write};
 
 use base64::Engine;
-use gawm_image::{Limits, decode_thumbnail, encode_jpeg};
+use gawm_image::{Limits, encode_jpeg};
 use gawm_schema::{Encoding, FeatureData, Kind, Role, Wrap};
 
 use super::{
@@ -340,7 +340,7 @@ pub(super) fn episodes(material: &Material<'_>, page: &mut String) {
 
 pub(super) fn cameras(material: &Material<'_>, timing: Option<&Timing>, page: &mut String) {
     let dataset = material.dataset;
-    let cameras = dataset.image_columns();
+    let cameras = dataset.frame_columns();
     let videos: Vec<&str> = dataset
         .info
         .features
@@ -382,8 +382,7 @@ pub(super) fn cameras(material: &Material<'_>, timing: Option<&Timing>, page: &m
 
 /// Returns a frame as a small picture inside the page.
 pub(super) fn embedded(frame: &FrameBytes) -> Option<String> {
-    let FrameBytes::Encoded(bytes) = frame else { return None };
-    let (_, picture) = decode_thumbnail(bytes, FRAME_WIDTH / 2, &Limits::default()).ok()?;
+    let (_, picture) = frame.thumbnail(FRAME_WIDTH / 2, &Limits::default()).ok()?;
     let small = if picture.width > FRAME_WIDTH {
         picture.shrunk(FRAME_WIDTH, (picture.height * FRAME_WIDTH / picture.width).max(1))
     } else {

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use gawm_image::{Limits, decode_thumbnail};
+use gawm_image::Limits;
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -79,7 +79,7 @@ pub(crate) fn camera_counts(
         if rows.is_empty() && run.n_rows > 0 { vec![run.n_rows as usize / 2] } else { rows }
     };
     let (mut summaries, mut all_runs) = (BTreeMap::new(), BTreeMap::new());
-    for camera in dataset.image_columns() {
+    for camera in dataset.frame_columns() {
         let runs: Vec<CameraCounts> = (0..dataset.runs.len())
             .into_par_iter()
             .map(|index| {
@@ -100,8 +100,7 @@ pub(crate) fn camera_counts(
 fn counts_of(frames: &[FrameBytes]) -> CameraCounts {
     let mut counts = CameraCounts::EMPTY;
     for frame in frames {
-        let FrameBytes::Encoded(bytes) = frame else { continue };
-        let Ok((_, picture)) = decode_thumbnail(bytes, 64, &Limits::default()) else { continue };
+        let Ok((_, picture)) = frame.thumbnail(64, &Limits::default()) else { continue };
         for pixel in picture.rgb.chunks_exact(3) {
             (0..3).for_each(|c| counts.channels[c][usize::from(pixel[c])] += 1);
         }

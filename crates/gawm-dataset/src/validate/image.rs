@@ -1,8 +1,8 @@
-//! Rules of group IMAGE: pictures in the data files, and the videos beside them.
+//! Rules of group IMAGE: pictures in the data files, frames of videos where this build decodes them, and the video files.
 
 use std::collections::BTreeMap;
 
-use gawm_image::{ImageError, Limits, decode_thumbnail};
+use gawm_image::Limits;
 
 use super::{
     Finding, Thresholds, continuity,
@@ -12,7 +12,7 @@ use super::{
     signal::Stretch,
     views,
 };
-use crate::read::{DType, Dataset, Defect, FrameBytes, FrameReader, Run};
+use crate::read::{DType, Dataset, Defect, FrameBytes, FrameReader, NoPicture, Run};
 
 /// Side of the thumbnails that frames are compared by.
 pub(super) const THUMB_SIDE: usize = 8;
@@ -60,46 +60,36 @@ impl FrameReader for Measurer {
         let run = &mut self.cameras[camera];
         let mut measure =
             FrameMeasure { hash: 0, mean: 0.0, std: 0.0, warmth: 0.0, is_picture: false, thumb: [0; THUMB] };
-        match frame {
-            FrameBytes::Absent => run.absent.push(row),
-            FrameBytes::TooLarge(n) => {
-                run.note_undecodable(row, format!("{n} bytes are more than are permitted"))
-            }
-            FrameBytes::Encoded(bytes) => {
-                let mut short = [0; 8];
-                short.copy_from_slice(&blake3::hash(&bytes).as_bytes()[..8]);
-                measure.hash = u64::from_le_bytes(short);
-                match decode_thumbnail(&bytes, 2 * THUMB_SIDE, &LIMITS) {
-                    Ok((header, picture)) => {
-                        let luma = picture.luma();
-                        let n = luma.len().max(1) as f64;
-                        let mean = luma.iter().map(|v| f64::from(*v)).sum::<f64>() / n;
-                        let variance = luma.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum::<f64>() / n;
-                        (measure.mean, measure.std, measure.is_picture) =
-                            (mean as f32, variance.sqrt() as f32, true);
-                        measure.warmth = warmth(&picture.rgb);
-                        measure.thumb.copy_from_slice(&picture.shrunk(THUMB_SIDE, THUMB_SIDE).luma());
-                        if let Some((height, width, channels)) = self.sizes[camera] {
-                            let got =
-                                (header.height as usize, header.width as usize, header.channels as usize);
-                            if got != (height, width, channels) {
-                                run.n_wrong_size += 1;
-                                if run.wrong_size.len() < 4 {
-                                    run.wrong_size.push((
-                                        row,
-                                        header.height,
-                                        header.width,
-                                        header.channels.into(),
-                                    ));
-                                }
-                            }
-                        }
+        if let Some(bytes) = frame.bytes() {
+            let mut short = [0; 8];
+            short.copy_from_slice(&blake3::hash(bytes).as_bytes()[..8]);
+            measure.hash = u64::from_le_bytes(short);
+        }
+        match frame.thumbnail(2 * THUMB_SIDE, &LIMITS) {
+            Ok((got, picture)) => {
+                let luma = picture.luma();
+                let n = luma.len().max(1) as f64;
+                let mean = luma.iter().map(|v| f64::from(*v)).sum::<f64>() / n;
+                let variance = luma.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum::<f64>() / n;
+                (measure.mean, measure.std, measure.is_picture) = (mean as f32, variance.sqrt() as f32, true);
+                measure.warmth = warmth(&picture.rgb);
+                measure.thumb.copy_from_slice(&picture.shrunk(THUMB_SIDE, THUMB_SIDE).luma());
+                if let Some((height, width, channels)) = self.sizes[camera]
+                    && got.map(|n| n as usize) != [height, width, channels]
+                {
+                    run.n_wrong_size += 1;
+                    if run.wrong_size.len() < 4 {
+                        run.wrong_size.push((row, got[0], got[1], got[2]));
                     }
-                    // Depth in floats is no picture.
-                    Err(ImageError::Unsuitable { .. }) => {}
-                    Err(e) => run.note_undecodable(row, e.to_string()),
                 }
             }
+            Err(NoPicture::Absent) => run.absent.push(row),
+            // Depth in floats is no picture.
+            Err(NoPicture::Depth) => {}
+            Err(NoPicture::TooLarge(n)) => {
+                run.note_undecodable(row, format!("{n} bytes are more than are permitted"));
+            }
+            Err(NoPicture::Damaged(reason)) => run.note_undecodable(row, reason),
         }
         run.frames.push(measure);
     }
@@ -145,7 +135,7 @@ pub(super) fn judge(
     runs: &[RunProfile],
     progress: impl Fn(usize) + Sync,
 ) -> Judgement {
-    let cameras = dataset.image_columns();
+    let cameras = dataset.frame_columns();
     if cameras.is_empty() {
         return Judgement::default();
     }

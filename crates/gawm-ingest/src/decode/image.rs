@@ -101,11 +101,11 @@ impl ImagePlan {
         let types = library.types(channel)?;
         let not_image = |detail: String| CompileError::NotAnImage { topic: channel.topic.to_owned(), detail };
         let is_video = channel.schema_name.ends_with("CompressedVideo");
-        if is_video && !crate::video::IS_BUILT {
+        if is_video && !gawm_video::IS_BUILT {
             return Err(not_image(format!(
                 "{} holds video packets, which this build does not decode; {}",
                 channel.schema_name,
-                crate::video::BUILD_HINT
+                crate::VIDEO_HINT
             )));
         }
         let has = |path: &[&str]| has_path(&types.table, path);

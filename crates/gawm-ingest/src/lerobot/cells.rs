@@ -13,7 +13,7 @@ use arrow::datatypes::{
 
 use crate::log::Channel;
 use crate::rows::{CDR_HEADER, HEADER_TEXT, align, channel, push_bytes, push_header, push_text};
-use crate::video::RgbFrame;
+use gawm_video::RgbFrame;
 
 /// Largest image file that is read by a path in a cell.
 const MAX_IMAGE_BYTES: u64 = 256 << 20;

@@ -20,7 +20,7 @@ use super::damage::damage_of;
 use super::{LerobotError, LerobotError as Error};
 use crate::log::{Block, BlockRef, Channel, Damage, DamageKind, Message, MetadataRecord};
 use crate::rows::{BLOCK_BYTES, EPISODE_GAP_NS, RowRecording, Unavailable};
-use crate::video::{self, VideoLanes};
+use gawm_video::VideoLanes;
 
 /// Columns that say which row it is, and nothing of the robot.
 const INDEX_COLUMNS: [&str; 4] = ["episode_index", "frame_index", "index", "timestamp"];
@@ -148,7 +148,7 @@ impl LerobotRecording {
         let features = self.dataset.info.features.iter();
         let (videos, absent): (Vec<&FeatureDecl>, Vec<&FeatureDecl>) = features
             .filter(|feature| !named.contains_key(&feature.name))
-            .partition(|f| video::IS_BUILT && f.dtype == DType::Video && self.has_video(&f.name));
+            .partition(|f| gawm_video::IS_BUILT && f.dtype == DType::Video && self.has_video(&f.name));
         for feature in videos {
             let id = u16::try_from(self.channels.len() + 1).map_err(|_beyond| Error::TooMany {
                 path: self.dataset.root.clone(),
@@ -182,7 +182,7 @@ impl LerobotRecording {
             (
                 "video_not_decoded",
                 "its frames are in video files, which this build does not decode",
-                video::BUILD_HINT,
+                crate::VIDEO_HINT,
             )
         } else {
             (

@@ -22,6 +22,9 @@ mod source;
 mod tests;
 mod unavailable;
 mod unpack;
+#[cfg(test)]
+#[cfg(feature = "video")]
+mod video_tests;
 
 #[cfg(test)]
 pub(crate) mod made_logs;

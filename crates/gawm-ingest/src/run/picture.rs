@@ -10,7 +10,7 @@ use gawm_schema::ImageSpec;
 
 use crate::contract::{self, ImageFormat};
 use crate::decode::{ImageKind, ImageMessage};
-use crate::video::RgbFrame;
+use gawm_video::RgbFrame;
 
 /// JPEG quality where the contract names none.
 const DEFAULT_QUALITY: u8 = 90;

@@ -12,7 +12,7 @@ use super::plan::Plans;
 use super::recording::OpenRecording;
 use crate::contract::{CheckedContract, Clock, ContractError, StreamData, TickRule};
 use crate::decode::SchemaLibrary;
-use crate::video::{PacketDecoder, VideoError};
+use gawm_video::{PacketDecoder, VideoError};
 
 /// Samples of the reference stream that its rate is measured from.
 const RATE_SAMPLES: usize = 400;

@@ -14,7 +14,7 @@ use crate::contract::{
 };
 use crate::decode::{CameraInfo, ImagePlan, RowSink, SchemaLibrary, decode_to_json};
 use crate::run::{Picture, schema_of};
-use crate::video::PacketDecoder;
+use gawm_video::PacketDecoder;
 
 /// Ticks per second are not proposed above this: more rows than a model needs.
 const MAX_RATE_HZ: f64 = 50.0;

@@ -7,7 +7,7 @@ use bytes::Bytes;
 use super::Session;
 use crate::run::block::DecodedMessage;
 use crate::run::picture::Picture;
-use crate::video::{PacketDecoder, RgbFrame, VideoError};
+use gawm_video::{PacketDecoder, RgbFrame, VideoError};
 
 /// Packets whose frames may be on their way: more than any stream reorders.
 const MAX_PENDING: usize = 64;

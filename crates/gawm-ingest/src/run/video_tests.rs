@@ -5,8 +5,8 @@ use std::path::Path;
 
 use base64::Engine as _;
 use gawm_dataset::read::{Dataset, FrameBytes, ReadLimits};
+use gawm_video::testing::{fixture, number_of, packets};
 
-use super::tests::{fixture, number_of, packets};
 use crate::decode::SchemaLibrary;
 use crate::log::OpenOptions;
 use crate::rows::{push_bytes, push_header, push_text};
@@ -69,7 +69,7 @@ fn log_of(
             log.channel("/video", "json", Some(("foxglove.CompressedVideo", "jsonschema", json)));
         }
     }
-    for (number, packet) in packets().iter().enumerate() {
+    for (number, packet) in packets().unwrap().iter().enumerate() {
         let packet = &change(number, packet);
         let time_ms = number as u64 * 100;
         log.write("/state", time_ms, format!("{{\"x\": {number}}}").as_bytes());

@@ -11,7 +11,7 @@ use super::h264::{PictureNumbers, units};
 use super::{RgbFrame, VideoError};
 
 /// Decodes the packets of one topic in their order.
-pub(crate) struct PacketDecoder {
+pub struct PacketDecoder {
     decoder: Decoder,
     id: Id,
     /// Whether a packet came from which decoding can begin.
@@ -21,7 +21,7 @@ pub(crate) struct PacketDecoder {
 
 impl PacketDecoder {
     /// Opens a decoder for a format as messages name it.
-    pub(crate) fn new(format: &str) -> Result<PacketDecoder, VideoError> {
+    pub fn new(format: &str) -> Result<PacketDecoder, VideoError> {
         let id = match format.trim().to_ascii_lowercase().as_str() {
             "h264" => Id::H264,
             "h265" | "hevc" => Id::HEVC,
@@ -37,7 +37,7 @@ impl PacketDecoder {
     ///
     /// # Errors
     /// The packet is damaged, or comes before the first from which decoding can begin.
-    pub(crate) fn push(&mut self, number: i64, data: &[u8]) -> Result<Vec<(i64, RgbFrame)>, VideoError> {
+    pub fn push(&mut self, number: i64, data: &[u8]) -> Result<Vec<(i64, RgbFrame)>, VideoError> {
         if data.is_empty() || data.len() > MAX_PACKET_BYTES {
             return Err(VideoError::Packet { detail: format!("it has {} bytes", data.len()) });
         }
@@ -64,7 +64,7 @@ impl PacketDecoder {
     }
 
     /// Returns the frames that are left at the end.
-    pub(crate) fn finish(&mut self) -> Vec<(i64, RgbFrame)> {
+    pub fn finish(&mut self) -> Vec<(i64, RgbFrame)> {
         let mut frames = Vec::new();
         self.decoder.drain(|frame| frames.push(frame));
         self.reset();

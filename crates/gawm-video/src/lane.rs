@@ -12,7 +12,7 @@ const MAX_OPEN: usize = 32;
 
 /// Video files that are read by several threads.
 #[derive(Debug, Default)]
-pub(crate) struct VideoLanes {
+pub struct VideoLanes {
     lanes: Mutex<State>,
     changed: Condvar,
 }
@@ -34,7 +34,7 @@ struct Lane {
 
 impl VideoLanes {
     /// Reads the frames at these times, which rise; `take` gets each of them, or why there is none.
-    pub(crate) fn read(
+    pub fn read(
         &self,
         path: &Path,
         wanted_secs: &[f64],

@@ -1,18 +1,14 @@
 //! Small videos made here, compared with what FFmpeg's own program says of them.
 
 use std::fs;
-use std::path::PathBuf;
 
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
 use sha2::{Digest, Sha256};
 
 use super::file::VideoFile;
+use super::testing::{fixture, number_of, packets};
 use super::*;
-
-pub(crate) fn fixture(name: &str) -> PathBuf {
-    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("src/video/fixtures").join(name)
-}
 
 /// The hash of each frame's planes, by `ffmpeg -f framehash`.
 fn hashes(name: &str) -> Vec<String> {
@@ -24,20 +20,6 @@ fn hashes(name: &str) -> Vec<String> {
 fn hash_at(file: &mut VideoFile, secs: f64) -> String {
     let planes = file.raw_at(secs).unwrap().plane_bytes();
     Sha256::digest(planes).iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-/// The number that is drawn into a frame.
-pub(crate) fn number_of(width: usize, rgb: &[u8]) -> usize {
-    (0..5).filter(|bit| rgb[(10 * width + bit * 12 + 6) * 3] > 128).map(|bit| 1 << bit).sum()
-}
-
-/// The packets of the byte stream, which begin with access unit delimiters.
-pub(crate) fn packets() -> Vec<Vec<u8>> {
-    let bytes = fs::read(fixture("packets.h264")).unwrap();
-    let starts: Vec<usize> =
-        (0..bytes.len() - 5).filter(|&at| bytes[at..at + 5] == [0, 0, 0, 1, 9]).collect();
-    let ends = starts.iter().skip(1).copied().chain([bytes.len()]);
-    starts.iter().zip(ends).map(|(start, end)| bytes[*start..end].to_vec()).collect()
 }
 
 const VIDEOS: [&str; 4] = ["h264.mp4", "hevc.mp4", "av1.mp4", "bt709.mp4"];
@@ -238,7 +220,7 @@ fn feed(packets: &[(usize, Vec<u8>)]) -> (Vec<usize>, Vec<(usize, VideoError)>) 
 
 #[test]
 fn packets_of_a_topic_give_their_frames() {
-    let all: Vec<(usize, Vec<u8>)> = packets().into_iter().enumerate().collect();
+    let all: Vec<(usize, Vec<u8>)> = packets().unwrap().into_iter().enumerate().collect();
     assert_eq!(feed(&all), ((0..30).collect(), Vec::new()));
     // A log that begins between two keyframes.
     let (numbers, errors) = feed(&all[13..]);
@@ -249,7 +231,7 @@ fn packets_of_a_topic_give_their_frames() {
 
 #[test]
 fn a_lost_packet_costs_those_up_to_the_next_keyframe() {
-    let mut some: Vec<(usize, Vec<u8>)> = packets().into_iter().enumerate().collect();
+    let mut some: Vec<(usize, Vec<u8>)> = packets().unwrap().into_iter().enumerate().collect();
     some.remove(14);
     let (numbers, errors) = feed(&some);
     assert_eq!(numbers, (0..14).chain(20..30).collect::<Vec<_>>());
@@ -262,7 +244,7 @@ fn packets_that_are_none_are_errors() {
         let mut decoder = PacketDecoder::new("h264").unwrap();
         assert!(decoder.push(0, bad).is_err() || decoder.finish().is_empty(), "{bad:?}");
         // The decoder goes on with the next keyframe.
-        assert_eq!(decoder.push(1, &packets()[0]).unwrap().len(), 1, "{bad:?}");
+        assert_eq!(decoder.push(1, &packets().unwrap()[0]).unwrap().len(), 1, "{bad:?}");
     }
     assert!(matches!(PacketDecoder::new("mjpeg"), Err(VideoError::Codec { .. })));
     assert!(matches!(PacketDecoder::new(""), Err(VideoError::Codec { .. })));

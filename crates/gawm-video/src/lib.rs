@@ -1,70 +1,70 @@
 //! Video: MP4 files of LeRobot folders and packets of `foxglove.CompressedVideo`, through FFmpeg's libraries.
 //!
-//! Only the cargo feature `video` links FFmpeg. Without it the same calls say that this build does not decode video, so
-//! that the rest of the crate does not care. Frames come out as 8-bit RGB: FFmpeg decodes, [`colour`] converts, and the
-//! conversion is our own integer arithmetic, equal to the bit on every machine.
+//! Only the cargo feature `ffmpeg` links FFmpeg. Without it the same calls say that this build does not decode video, so
+//! that callers do not care. Frames come out as 8-bit RGB: FFmpeg decodes, and the conversion is our own integer
+//! arithmetic, equal to the bit on every machine.
 //!
-//! Files are read by time: a frame belongs to a row when its presentation time is within [`TOLERANCE_SECS`] of the row's,
+//! Files are read by time: a frame belongs to a row when its presentation time is within 0.1 ms of the row's,
 //! as `lerobot` has it. One pass in order; jumps back, and far forward, seek. No more than one frame is kept.
 
-#[cfg(feature = "video")]
+#![forbid(unsafe_code)]
+
+#[cfg(feature = "ffmpeg")]
 mod colour;
-#[cfg(feature = "video")]
+#[cfg(feature = "ffmpeg")]
 mod decoder;
-#[cfg(feature = "video")]
+#[cfg(feature = "ffmpeg")]
 mod file;
-#[cfg(feature = "video")]
+#[cfg(feature = "ffmpeg")]
 mod h264;
-#[cfg(feature = "video")]
+#[cfg(feature = "ffmpeg")]
 mod lane;
-#[cfg(feature = "video")]
+#[cfg(feature = "ffmpeg")]
 mod packets;
-#[cfg(not(feature = "video"))]
+pub mod testing;
+#[cfg(not(feature = "ffmpeg"))]
 mod without;
 
 #[cfg(test)]
-#[cfg(feature = "video")]
-mod run_tests;
-#[cfg(test)]
-#[cfg(feature = "video")]
+#[cfg(feature = "ffmpeg")]
 mod tests;
 
 use bytes::Bytes;
 
-#[cfg(feature = "video")]
-pub(crate) use lane::VideoLanes;
-#[cfg(feature = "video")]
-pub(crate) use packets::PacketDecoder;
-#[cfg(not(feature = "video"))]
-pub(crate) use without::{PacketDecoder, VideoLanes};
+#[cfg(feature = "ffmpeg")]
+pub use lane::VideoLanes;
+#[cfg(feature = "ffmpeg")]
+pub use packets::PacketDecoder;
+#[cfg(not(feature = "ffmpeg"))]
+pub use without::{PacketDecoder, VideoLanes};
 
 /// Whether this build decodes video.
-pub(crate) const IS_BUILT: bool = cfg!(feature = "video");
-
-/// What to do about a build without video.
-pub(crate) const BUILD_HINT: &str = "build with `cargo build --release -p gawm-ingest --features video` (needs libavcodec-dev, libavformat-dev, libavutil-dev), convert the videos to images (lerobot-edit-dataset has convert_video_to_image), or remove its stream";
+pub const IS_BUILT: bool = cfg!(feature = "ffmpeg");
 
 /// Largest difference between the time of a row and that of its frame, as in `lerobot`.
-#[cfg(feature = "video")]
-pub(crate) const TOLERANCE_SECS: f64 = 1e-4;
+#[cfg(feature = "ffmpeg")]
+pub const TOLERANCE_SECS: f64 = 1e-4;
 
 /// One decoded frame: rows of 8-bit RGB without padding.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct RgbFrame {
-    pub(crate) width: u32,
-    pub(crate) height: u32,
-    pub(crate) data: Bytes,
+pub struct RgbFrame {
+    /// Pixels in a row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Shape [height, width, 3].
+    pub data: Bytes,
 }
 
 /// Why a frame cannot be had.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
-pub(crate) enum VideoError {
+pub enum VideoError {
     /// This build has no decoder.
     #[error("this build does not decode video")]
     NotBuilt,
     /// The file is no video that FFmpeg reads.
-    #[cfg(feature = "video")]
+    #[cfg(feature = "ffmpeg")]
     #[error("not a readable MP4: {detail}: {path:?}")]
     Open {
         /// The file.
@@ -73,14 +73,14 @@ pub(crate) enum VideoError {
         detail: String,
     },
     /// A codec that is not decoded.
-    #[cfg(feature = "video")]
+    #[cfg(feature = "ffmpeg")]
     #[error("video codec {got:?}, expected h264, h265, av1 or vp9")]
     Codec {
         /// Its name.
         got: String,
     },
     /// Frames of a size or of colours that are not taken.
-    #[cfg(feature = "video")]
+    #[cfg(feature = "ffmpeg")]
     #[error("{what}: expected {expected}, got {got}")]
     Frame {
         /// What is wrong.
@@ -91,7 +91,7 @@ pub(crate) enum VideoError {
         got: String,
     },
     /// No frame has the time of a row.
-    #[cfg(feature = "video")]
+    #[cfg(feature = "ffmpeg")]
     #[error("no frame at {wanted_secs:.4} s: expected one within 0.1 ms, got {nearest}")]
     NoFrame {
         /// The time of the row in the file.
@@ -100,14 +100,14 @@ pub(crate) enum VideoError {
         nearest: String,
     },
     /// A packet that cannot be decoded.
-    #[cfg(feature = "video")]
+    #[cfg(feature = "ffmpeg")]
     #[error("damaged video packet: {detail}")]
     Packet {
         /// What FFmpeg says.
         detail: String,
     },
     /// A packet before the first from which decoding can begin.
-    #[cfg(feature = "video")]
+    #[cfg(feature = "ffmpeg")]
     #[error("video packet before the first keyframe")]
     BeforeKeyframe,
     /// A packet whose frame never came.
@@ -116,20 +116,28 @@ pub(crate) enum VideoError {
 }
 
 impl VideoError {
+    /// Returns whether there is a readable video, and no frame in it at the wanted time.
+    pub fn is_no_frame(&self) -> bool {
+        #[cfg(feature = "ffmpeg")]
+        return matches!(self, VideoError::NoFrame { .. });
+        #[cfg(not(feature = "ffmpeg"))]
+        return false;
+    }
+
     /// Returns the reason for counting.
-    pub(crate) fn reason(&self) -> &'static str {
+    pub fn reason(&self) -> &'static str {
         match self {
             VideoError::NotBuilt => "video_not_decoded",
             VideoError::Unfinished => "corrupt_video",
-            #[cfg(feature = "video")]
+            #[cfg(feature = "ffmpeg")]
             VideoError::Open { .. } => "unreadable_video",
-            #[cfg(feature = "video")]
+            #[cfg(feature = "ffmpeg")]
             VideoError::Codec { .. } | VideoError::Frame { .. } => "unsupported_image",
-            #[cfg(feature = "video")]
+            #[cfg(feature = "ffmpeg")]
             VideoError::NoFrame { .. } => "no_frame",
-            #[cfg(feature = "video")]
+            #[cfg(feature = "ffmpeg")]
             VideoError::Packet { .. } => "corrupt_video",
-            #[cfg(feature = "video")]
+            #[cfg(feature = "ffmpeg")]
             VideoError::BeforeKeyframe => "before_keyframe",
         }
     }

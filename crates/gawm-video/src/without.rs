@@ -6,28 +6,38 @@ use super::{RgbFrame, VideoError};
 
 /// Decodes no packets.
 #[derive(Debug)]
-pub(crate) struct PacketDecoder;
+pub struct PacketDecoder;
 
 impl PacketDecoder {
-    pub(crate) fn new(_format: &str) -> Result<PacketDecoder, VideoError> {
+    /// Fails.
+    ///
+    /// # Errors
+    /// [`VideoError::NotBuilt`].
+    pub fn new(_format: &str) -> Result<PacketDecoder, VideoError> {
         Err(VideoError::NotBuilt)
     }
 
-    pub(crate) fn push(&mut self, _number: i64, _data: &[u8]) -> Result<Vec<(i64, RgbFrame)>, VideoError> {
+    /// Fails.
+    ///
+    /// # Errors
+    /// [`VideoError::NotBuilt`].
+    pub fn push(&mut self, _number: i64, _data: &[u8]) -> Result<Vec<(i64, RgbFrame)>, VideoError> {
         Err(VideoError::NotBuilt)
     }
 
-    pub(crate) fn finish(&mut self) -> Vec<(i64, RgbFrame)> {
+    /// Returns nothing.
+    pub fn finish(&mut self) -> Vec<(i64, RgbFrame)> {
         Vec::new()
     }
 }
 
 /// Reads no files.
 #[derive(Debug, Default)]
-pub(crate) struct VideoLanes {}
+pub struct VideoLanes {}
 
 impl VideoLanes {
-    pub(crate) fn read(
+    /// Says of every time that there is no frame.
+    pub fn read(
         &self,
         _path: &Path,
         wanted_secs: &[f64],
