@@ -57,7 +57,7 @@ fn what_is_printed_collects_the_same_logs() {
 fn unusable_arguments_are_2_and_say_what_was_expected() {
     let dir = tempfile::tempdir().unwrap();
     let out = folder(dir.path(), "out");
-    check_fails(&["collect", "--episodes", "1", "--out", &out], 2, &["seed: expected a number, got nothing"]);
+    check_fails(&["collect", "--episodes", "1", "--out", &out], 2, &["seed: expected a number (--seed N)"]);
     check_fails(
         &["collect", "--episodes", "1", "--seed", "1", "--set", "sede=1", "--out", &out],
         2,
