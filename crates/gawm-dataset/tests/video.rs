@@ -1,5 +1,6 @@
 //! Frames of videos: each belongs to its row, and what is wrong with them is found.
 #![cfg(feature = "video")]
+#![cfg_attr(feature = "video", expect(clippy::unwrap_used, reason = "a test stops where its set-up fails"))]
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
